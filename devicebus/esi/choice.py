@@ -187,6 +187,7 @@ def manager_for(device: EsiDevice, pdo: EsiPdo) -> int | None:
         (
             number
             for number, each in enumerate(device.sync_managers)
+            # A virtual one takes no PDO: an FMMU maps registers in its place.
             if not each.is_mailbox and each.is_output is pdo.is_output and not each.is_virtual
         ),
         None,
@@ -397,6 +398,7 @@ def default_config(plan: EsiPlan) -> SlaveConfig:
         },
         fixed_pdos=not plan.takes_assignment,
         writes=(*_module_list(plan), *_writes(device)),
+        # AssignActivate is registers 0x0980 and 0x0981: without the high byte no SYNC runs.
         sync=mode if mode is not None and mode.activate >> 8 else None,
         timeouts=device.timeouts,
         revision_rule=device.revision_rule or RevisionRule.EXACT,
@@ -408,6 +410,7 @@ def _module_list(plan: EsiPlan) -> Iterator[SdoWrite]:
     """Yield the writes of the configured module ident list (ETG.5001, object 0xF030)."""
     if not (plan.device.downloads_modules and plan.modules):
         return
+    # As a list of PDOs: emptied first, and its length last, so that it is never half valid.
     yield SdoWrite(index=MODULE_LIST, data=b"\0", comment="modules")
     for subindex, ident in enumerate(plan.modules, 1):
         yield SdoWrite(index=MODULE_LIST, subindex=subindex, data=ident.to_bytes(4, "little"))

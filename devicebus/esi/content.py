@@ -18,6 +18,7 @@ MAX_MODULES = 20_000
 _VENDOR = f"{ROOT}/Vendor"
 _DEVICE = f"{ROOT}/Descriptions/Devices/Device"
 _MODULE = f"{ROOT}/Descriptions/Modules/Module"
+# The files of one vendor may have 180 MB: a list reads no more of a device than this.
 _HEAD = ("Type", "HideType", "Name")
 # Pictures are much of some files, and nothing here shows them.
 _IGNORED = ("ImageData16x14", "Image16x14", "ImageFile16x14", "URL")
@@ -101,6 +102,7 @@ def load_device(stream: BinaryIO, listed: ListedDevice) -> DeviceResult:
         if element.tag == "Vendor":
             vendor, vendor_name = fields.child(element, "Id"), english(element)
             continue
+        # Faults of devices before the wanted one do not count.
         own = identify(element, Fields())
         if (own.product, own.revision, own.type) == (listed.product, listed.revision, listed.type):
             device = read_device(element, vendor, vendor_name, fields)

@@ -91,6 +91,7 @@ def read_device(element: XmlElement, vendor: int, vendor_name: str, fields: Fiel
         downloads_modules=slots is not None and flag(slots, "DownloadModuleIdentList"),
         timeouts=_timeouts(element, fields),
         starts_without_sync=_flag_at(element, "Info/StateMachine/Behavior", "StartToSafeopNoSync"),
+        # Negative for a device that feeds the E-bus, such as a coupler.
         ebus_ma=fields.child(element, "Info/Electrical/EBusCurrent", bits=16, is_signed=True),
         has_reg134_identification=is_true(element.findtext("Info/IdentificationReg134")),
         profile_number=fields.optional_child(element, "Profile/ProfileNo"),
@@ -126,6 +127,7 @@ def read_module(
     )
 
 
+# Words of the revision number: the high one is the revision, the low one a special version.
 _RULES = {
     "NONE": RevisionRule.ANY,
     "EQ": RevisionRule.EXACT,
@@ -156,6 +158,7 @@ def _sync_managers(device: XmlElement, fields: Fields) -> Iterator[EsiSyncManage
         except ValueError:
             known = ", ".join(SmUse)
             fields.report(each.line, f"sync manager with use {each.text[:40]!r}", f"one of {known}")
+            # Kept, because PDOs refer to the sync managers behind it by their numbers.
             use = SmUse.INPUTS
         minimum, default, maximum = (
             fields.optional_attribute(each, name, bits=16) for name in _SIZES
@@ -167,6 +170,7 @@ def _sync_managers(device: XmlElement, fields: Fields) -> Iterator[EsiSyncManage
             min_size=minimum,
             max_size=maximum,
             control=fields.optional_attribute(each, "ControlByte", bits=8),
+            # A number is the activate register (0x0806), whose bit 0 it is: a file has 9.
             is_enabled=bool(fields.attribute(each, "Enable", bits=8, default=1) & 1)
             if _is_numeric(each, "Enable")
             else flag(each, "Enable"),
@@ -189,6 +193,7 @@ def _fmmus(device: XmlElement, fields: Fields) -> Iterator[EsiFmmu]:
 def _pdos(
     parent: XmlElement, managers: Sequence[EsiSyncManager], fields: Fields
 ) -> Iterator[EsiPdo]:
+    # In the order of the file: of PDOs that exclude each other the first one is the default.
     found = [each for each in parent.children if each.tag in {"RxPdo", "TxPdo"}]
     if len(found) > MAX_PDOS:
         message = f"{len(found)} PDOs"
@@ -245,7 +250,6 @@ def _entry(entry: XmlElement, fields: Fields) -> EsiPdoEntry:
         bits = 0
     return EsiPdoEntry(
         index=fields.child(entry, "Index", bits=16),
-        # Beckhoff's tables have a few subindexes as bytes with a sign.
         subindex=fields.child(entry, "SubIndex", bits=8),
         bits=bits,
         name=english(entry),
@@ -277,6 +281,7 @@ def _coe(coe: XmlElement) -> EsiCoe:
         pdo_config=flag(coe, "PdoConfig"),
         pdo_upload=flag(coe, "PdoUpload"),
         complete_access=flag(coe, "CompleteAccess"),
+        # Hardly a file has it: its absence cannot mean that a device refuses segments.
         segmented_sdo="SegmentedSdo" not in coe.attrib or flag(coe, "SegmentedSdo"),
         diagnosis_history=flag(coe, "DiagHistory"),
     )
@@ -305,7 +310,6 @@ def _init_command(each: XmlElement, place: str, fields: Fields) -> EsiInitComman
     data = each.find("Data")
     return EsiInitCommand(
         transitions=transitions,
-        # Some files write IDNs and indexes as numbers with a sign.
         index=fields.child(each, place, bits=16),
         subindex=fields.child(each, "SubIndex", bits=8),
         channel=fields.attribute(each, "Chn", bits=8),
@@ -325,6 +329,7 @@ def _op_modes(modes: XmlElement, fields: Fields) -> Iterator[EsiOpMode]:
         mode = OpMode(
             name=each.findtext("Name"),
             activate=fields.child(each, "AssignActivate", bits=16),
+            # A time of 0 is that of the bus cycle, times the factor.
             cycle0_ns=fields.child(each, "CycleTimeSync0"),
             factor0=_factor(each, "CycleTimeSync0", 1, fields),
             shift0_ns=fields.child(each, "ShiftTimeSync0", is_signed=True),
@@ -401,6 +406,7 @@ def _eeprom(eeprom: XmlElement | None, fields: Fields) -> EsiEeprom:
         size = 0
     return EsiEeprom(
         byte_size=size,
+        # Words 0 to 6 of the SII; word 7 is their checksum, which is computed.
         config_data=fields.octets(eeprom.find("ConfigData"), "ConfigData")[:14],
         bootstrap=fields.octets(eeprom.find("BootStrap"), "BootStrap"),
         image=fields.octets(eeprom.find("Data"), "Data"),

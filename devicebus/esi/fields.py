@@ -14,6 +14,7 @@ MAX_FINDINGS = 200
 """Findings kept of one file."""
 _SHOWN = 40
 _TRUE = frozenset(("1", "true"))
+# Language identifiers of Windows: the United States and the United Kingdom.
 _ENGLISH = frozenset(("1033", "2057"))
 _EXPECTED = "a number such as #x1A00 or 6656"
 

@@ -60,6 +60,7 @@ def name_entries(
     named = [(entry_name(each), each) for each in entries if each.index]
     first = [each for each in named if each[1].pdo in assigned]
     others = [each for each in named if each[1].pdo not in assigned]
+    # An optional PDO often has entries of the same names: those in use by default stay plain.
     counts = Counter(name for name, _ in first)
     taken = {name for name, times in counts.items() if times == 1}
     result = []

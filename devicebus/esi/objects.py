@@ -28,6 +28,7 @@ class _SubItem(NamedTuple):
 
 def type_of(name: str, bits: int) -> str:
     """Return the type *name* if it has *bits* bits, otherwise a type that holds them."""
+    # The length goes before the name: it is what a PDO mapping and an SDO carry.
     try:
         kind = datatypes.parse(name)
     except ValueError:
@@ -104,6 +105,7 @@ class _DictionaryReader:
                 yield from self._elements(self._types.get(name), access)
                 continue
             subindex = self._fields.child(item, "SubIdx")
+            # Subindex 0 of a record is the number of its entries, which follows from the others.
             if 0 < subindex <= _MAX_SUBINDEX and 0 < bits <= _MAX_BITS:
                 label = english(item) or f"SubIndex {subindex:03}"
                 yield _SubItem(subindex, label, type_of(self._base(name), bits), access)
@@ -122,6 +124,7 @@ class _DictionaryReader:
             yield _SubItem(subindex, f"SubIndex {subindex:03}", kind, access)
 
     def _entries(self, item: XmlElement, parts: tuple[_SubItem, ...]) -> Iterator[EsiValue]:
+        # Initial values have the names of subindexes, not their numbers, and some may be missing.
         info = item.find("Info")
         infos: dict[str, XmlElement | None] = {}
         for each in () if info is None else info.iterfind("SubItem"):
@@ -170,5 +173,6 @@ def _access(item: XmlElement) -> Access:
     if flags is None:
         return RW
     access = _ACCESS.get(flags.text.lower(), RW)
+    # ETG.2000 has further restrictions, but known files have this one only.
     is_restricted = flags.get("WriteRestrictions").lower() == "preop"
     return RW_PREOP if access == RW and is_restricted else access

@@ -119,6 +119,7 @@ class FrameAssembler:
 
     def _drop(self, number: int) -> None:
         self._content = None
+        # A frame counts once, however many of its fragments follow.
         self.dropped += number != self._dropped_number
         self._dropped_number = number
 

@@ -128,6 +128,7 @@ class FoeServer:
             self._writer = self._store.open_write(text_of(body), header.number)
             self._number = 0
             self._busy_until_ns = now_ns
+            # Data is counted from 1: 0 answers the request.
             return [encode_message(FoeOpcode.ACK, 0)]
         if opcode is FoeOpcode.ERROR:
             self.reset()
@@ -153,6 +154,7 @@ class FoeServer:
         packet_size = self._sizes.to_master - DATA_OVERHEAD
         data = reader.read(packet_size)
         self._number = number
+        # The end is a packet that is not full, so a file of whole packets ends with an empty one.
         self._is_last = len(data) < packet_size
         self._sent = encode_message(FoeOpcode.DATA, number, data)
         return [self._sent]

@@ -98,6 +98,7 @@ def identify_arrivals(bus: BusState, stations: Sequence[int]) -> Procedure[list[
     }
     known = list(stations)
     for position, station in enumerate(stations):
+        # The first slave with an address has it; a later one has kept it from before.
         if station in order and known.index(station) == position:
             away.pop(station, None)
             continue
@@ -124,6 +125,7 @@ def identify_arrivals(bus: BusState, stations: Sequence[int]) -> Procedure[list[
             yield from assign_stations([(position, fitting[0])])
         else:
             strangers.append(f"position {position}: {identity}: expected no slave like this here")
+            # The next arrival needs the address of the probe.
             yield from assign_stations([(position, 0)])
     bus.strangers = tuple(strangers)
     return places

@@ -234,6 +234,7 @@ class Master:
 
     def handle_timeout(self, now_ns: int) -> None:
         """Handle expired timers; early calls have no effect."""
+        # Before the time-outs of the link: one half may be the answer to a frame.
         self.merge_overdue(now_ns)
         self._bus.link.handle_timeout(now_ns)
         self._bus.runner.handle_timeout(now_ns)

@@ -45,8 +45,11 @@ DEAD_NS = 50_000_000
 """Minimum time without a copy after which a line is dead."""
 DEAD_TIMEOUTS = 4
 """The same in time-outs that follow the round trip of copies: a slow bus is not dead."""
+# Time alone is no sign: nothing comes back while nothing is sent.
 DEAD_COPIES = 3
 """Copies that have to be missing on it meanwhile."""
+# Of the fields that no controller changes, the index is the one that a master may choose: it tells
+# the copies apart, on whichever line they return.
 _SECOND_BIT = RING_INDEXES
 _HEADER = struct.Struct("<BBHHHH")
 _SIZE = DatagramHeader.SIZE
@@ -55,6 +58,7 @@ _MORE = 0x8000
 _BY_POSITION = frozenset((Command.APRD, Command.APWR, Command.APRW, Command.ARMW))
 _BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
 _LOGICAL = frozenset((Command.LRD, Command.LWR, Command.LRW))
+# Only these are answered on both sides of a cut: a station, or a position, is on one side.
 _JOINED = _LOGICAL | _BROADCAST
 _COUNTED = _BY_POSITION | _BROADCAST
 _NOP, _FRMW = int(Command.NOP), int(Command.FRMW)
@@ -152,6 +156,7 @@ class Ring:
             self._number += 1
             self._sent[index] = _SentCopies(frame, copy, self._number, now_ns)
         if not self._heard_ns[0]:
+            # Silence counts from the first frame on.
             self._heard_ns = [now_ns, now_ns]
         return copies
 
@@ -209,6 +214,8 @@ class Ring:
             ):
                 self._silent[line] = True
                 if line is RingEnd.FIRST:
+                    # The frames of the second line turn back at port 0 of the first slave, so they
+                    # pass all slaves in the order of the first line: none is before the cut.
                     self._set_reached(0, now_ns)
                 self._end(sent)
                 frames.append(_merge(sent.copies[0], *sent.halves))
@@ -339,11 +346,14 @@ class Ring:
 
 def _is_copy(data: Buffer, sent: bytes) -> bool:
     """Return true if *data* has the datagrams of *sent*, processed or not."""
+    # Ethernet pads short frames, so more may follow.
     if len(data) < len(sent) or data[1] >> 4 != sent[1] >> 4:
         return False
     offset = EtherCatHeader.SIZE
     more = _MORE
     while more:
+        # Not ADP, which slaves count up, the event bits (IRQ), which they set, or the bit of a
+        # circulating frame in the word of the length.
         command, index, _, ado, word, _ = _HEADER.unpack_from(sent, offset)
         there = _HEADER.unpack_from(data, offset)
         same = (command, index, ado, word & _LENGTH)
@@ -368,6 +378,7 @@ def _merge(sent: bytes, first: bytes | None, second: bytes | None) -> bytes:
             for half in (first, second)
         ]
         if all(counts) and command in _JOINED:
+            # Written data is the same in both halves, and read data came into zeros.
             joined = int.from_bytes(first[start:end], "little")  # type: ignore[index]
             joined |= int.from_bytes(second[start:end], "little")  # type: ignore[index]
             frame[start:end] = joined.to_bytes(end - start, "little")

@@ -64,6 +64,7 @@ class PdoMapping:
                 continue
             word = int.from_bytes(data[run.first : run.end], "little")
             if run.is_small:
+                # Digital terminals have hardly anything else: their bytes exist once for all.
                 for entry, shift, mask in run.fields:
                     entry.octets = _OCTETS[word >> shift & mask]
                 continue
@@ -190,6 +191,7 @@ class ProcessData:
         end = 0
         for pdo in pdos:
             for mapping in self._numbers(pdo):
+                # Index, subindex and bits, from the highest byte on (ETG.1000.6).
                 bits = mapping & 0xFF
                 entries.append(
                     MappedEntry(self._entry(mapping >> 16, mapping >> 8 & 0xFF), end, bits)

@@ -189,6 +189,7 @@ def encode_text(text: str) -> bytes:
 def decode_name(data: Buffer) -> str:
     """Return the name in a request: UTF-8 or TwinCAT's encoding, up to a NUL."""
     octets, _, _ = bytes(data).partition(b"\0")
+    # UTF-8 first: a text of cp1252 with more than ASCII is hardly ever valid UTF-8.
     try:
         return octets.decode()
     except UnicodeDecodeError:
@@ -268,6 +269,7 @@ def encode_data_type(entry: DataTypeEntry) -> bytes:
     parts = [text + b"\0" for text in texts]
     parts += [each.encode() for each in entry.dimensions]
     parts += [encode_data_type(item) for item in entry.items]
+    # Behind the members, in the order of their flags.
     parts += [entry.guid, _encode_attributes(entry.attributes), _encode_values(entry)]
     behind = b"".join(parts)
     head = _DataTypeHead(

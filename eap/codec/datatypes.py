@@ -82,6 +82,7 @@ _BASE: dict[str, DataType] = {
         _integer("INT56", 0x14, 56, signed=True),
         _integer("LINT", 0x15, 64, signed=True),
         _integer("UINT24", 0x16, 24),
+        # 0x17 is reserved.
         _integer("UINT40", 0x18, 40),
         _integer("UINT48", 0x19, 48),
         _integer("UINT56", 0x1A, 56),

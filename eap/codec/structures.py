@@ -63,6 +63,7 @@ class Structure(DataType, frozen=True, kw_only=True):
     @property
     def is_union(self) -> bool:
         """True if the members lie at the same place."""
+        # One member alone is the same either way.
         return len(self.members) > 1 and all(not each.bit_offset for each in self.members)
 
     def compose(self, seen: dict[str, DataType]) -> str:
@@ -138,6 +139,7 @@ class Structure(DataType, frozen=True, kw_only=True):
             raise self._refuse(plain, f"members such as {{{self.members[0].name}: …}}")
         self._given(plain)
         if self.is_union:
+            # Zeros for the other members would contradict the one that is given.
             return dict(plain) if plain else self.to_plain(self.zero)
         return {
             name: complete(kind, plain[name]) if name in plain else kind.to_plain(kind.zero)
@@ -271,6 +273,7 @@ def make_structure(name: str, members: Sequence[Member], size: int, align: int) 
         _check_overlaps(name, members)
     return Structure(
         _structure_text(name, size, align, members, {}),
+        # OCTET_STRING: SDO information has no code for a struct.
         0x0A,
         8 * size,
         size,
@@ -290,6 +293,8 @@ def _check_place(name: str, member: Member, size: int) -> None:
             raise ValueError(f"{where} has bits of two bytes")
     elif member.bit_offset % 8:
         raise ValueError(f"{where} does not start on a whole byte")
+    # BOOL is one bit in a PD (ETG.1005).  A struct is the memory of a controller, where a BOOL has
+    # a byte: its text must say which one is meant.
     if isinstance(member.kind, Boolean) and member.kind.is_bits:
         raise ValueError(f"{where} is a lone bit: expected BOOL8 or BIT")
 
@@ -339,6 +344,7 @@ def lay_out_structure(
         end += kind.bit_length
         largest = max(largest, end)
     size = -(-largest // 8)
+    # Padded at the end, so that the next element of an array is aligned, too.
     return make_structure(name, placed, size + -size % align, align)
 
 
@@ -418,6 +424,7 @@ def _element_hint(kind: DataType) -> str:
 
 def split_paths(name: str) -> Iterator[tuple[str, str]]:
     """Yield each way to divide *name* into a variable and a path, the longest variable first."""
+    # Names of variables have dots of their own: bus0.axis.csp.Target.
     for match in reversed(list(_DELIMITERS.finditer(name))):
         if match.start():
             yield name[: match.start()], name[match.start() :]
@@ -465,6 +472,7 @@ def shared_parts(old: DataType, new: DataType) -> Iterator[SharedPart]:
     elif (
         isinstance(old, Structure)
         and isinstance(new, Structure)
+        # In a union the copy of one member would overwrite that of another.
         and not (old.is_union or new.is_union)
     ):
         for member in new.members:

@@ -35,6 +35,7 @@ _QUALITY_SIZE = 2
 
 def tracker_word(image: Image, slot: RxSlot) -> int:
     """Return the index of the first word of the block that holds a subscription's tracker."""
+    # PDs that have always arrived together share the tracker of one of them.
     return int(image.words[slot.words + RxWord.TRACKER]) or slot.words
 
 
@@ -70,6 +71,7 @@ class ForwardedQuality:
 
     def into(self, buffer: memoryview, offset: int) -> None:
         """Write it to the header of the PD whose data starts at *offset* of *buffer*."""
+        # A PD header has one quality for all values of the PD.
         oldest = max(quality(self._image, slot) for slot in self._slots)
         _put_u16(buffer, offset - _QUALITY_SIZE, oldest)
 

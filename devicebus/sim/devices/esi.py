@@ -57,8 +57,10 @@ _SM_TYPES = {
     SmUse.DYNAMIC_INPUTS: 4,
 }
 _SINGLE_BUFFER = 2
+# A buffered sync manager has three areas of its length, one behind the other.
 _BUFFERS = 3
 _MEMORY = 0x1000
+# Addresses have 16 bits, and the first 4 KiB are registers.
 _MAX_RAM = 60 << 10
 _CONTROL_WORD, _STATUS_WORD = 0x6040, 0x6041
 _MAX_AXES = 8
@@ -87,6 +89,7 @@ def complete(spec: SlaveSpec, plan: EsiPlan) -> SlaveSpec:
         clock=msgspec.structs.replace(clock, needs_sync0=needs) if device.has_dc else None,
         inputs=tuple(_with_sources(inputs, spec.inputs, device)),
         outputs=tuple(_with_sources(outputs, spec.outputs, device)),
+        # Without its words for BOOT an EEPROM names no mailbox for that state.
         boot=spec.boot and bool(device.mailbox) and any(device.eeprom.bootstrap),
     )
 
@@ -136,6 +139,7 @@ def _mailbox(device: EsiDevice) -> MailboxSpec | None:
     if mailbox is None or sizes is None:
         return None
     return MailboxSpec(
+        # More does not fit into the datagram of one frame.
         size=min(max(32, *sizes), 1486),
         coe=mailbox.coe is not None,
         foe=mailbox.foe,

@@ -52,6 +52,7 @@ _WRITES = frozenset((2, 5))
 """Commands APWR and FPWR."""
 _FMMU, _MANAGER, _END = 0x600, 0x800, 0x880
 _EEPROM = 0x502
+# Words of the SII: 0x08 is the vendor, 0x0A the product.
 _REVISION_WORD = 0x0C
 _AL_STATUS, _ACTIVATE, _CYCLE0, _CYCLE1 = 0x130, 0x980, 0x9A0, 0x9A4
 _ASSIGNMENTS, _MAPPINGS = range(0x1C10, 0x1C30), (range(0x1600, 0x1800), range(0x1A00, 0x1C00))
@@ -115,6 +116,7 @@ class _EniReader:
             name=self._name,
             slaves=tuple(self._slaves),
             variables=tuple(self._variables),
+            # One for each task: the bus has the cycle of the fastest.
             cycle_us=min(self._cycles, default=0),
         )
 
@@ -219,6 +221,7 @@ class _SlaveReader:
             if found := element.find(f"Mailbox/{protocol}/InitCmds/InitCmd"):
                 hint = ": the key eoe of the port has IP settings" if protocol == "EoE" else ""
                 self._note(found.line, ImportOutcome.LEFT, f"start-up commands of {protocol}{hint}")
+        # The type is in EL2004-0000-0018, or in the name that TwinCAT gives: Term 2 (EL2004).
         revision = info.findtext("ProductRevision").partition("-")[0]
         inside = self._name.rpartition("(")[2].partition(")")[0] if "(" in self._name else ""
         hot = element.find("HotConnect")
@@ -226,6 +229,7 @@ class _SlaveReader:
         managers = self._managers(assigns)
         pdos = self._pdos()
         mapping = self._known_mapping(mapping, managers, pdos)
+        # As the master sees them: it sends outputs.
         sides = [f"ProcessData/{tag}/BitLength" for tag in ("Send", "Recv", "Receive")]
         bits = [element.number_at(path, 0, _U32) for path in sides]
         return EniSlave(
@@ -253,6 +257,7 @@ class _SlaveReader:
             group="" if hot is None else hot.findtext("GroupName") or self._name,
             members=1 if hot is None else hot.number_at("GroupMemberCnt", 1, MAX_SLAVES, 1),
             identification=None if hot is None else _identification(hot),
+            # Commands compare words of the EEPROM: without that of the revision any one will do.
             any_revision=bool(self._checked) and _REVISION_WORD not in self._checked,
             output_bits=bits[0],
             input_bits=bits[1] or bits[2],
@@ -268,9 +273,11 @@ class _SlaveReader:
         at = [each.text for each in command.iterfind("Transition")]
         if code in _READS and register == _AL_STATUS:
             self._take_timeout(command, at)
+        # Commands of the way down clear what those of the way up have set.
         if code not in _WRITES or not {"IP", "PS", "SO"} & set(at):
             return
         data = _octets(command)
+        # Two bytes of control, then the address of the word to read.
         if register == _EEPROM and len(data) >= 4:
             self._checked.add(data[2])
         if _FMMU <= register < _MANAGER:
@@ -289,6 +296,7 @@ class _SlaveReader:
 
     def _take_time(self, register: int, data: bytes) -> None:
         value = int.from_bytes(data[:4], "little")
+        # The two bytes of AssignActivate are registers of their own.
         if register == _ACTIVATE + 1:
             register, value = _ACTIVATE, (value & 0xFF) << 8
         if register == _ACTIVATE:
@@ -300,6 +308,7 @@ class _SlaveReader:
 
     def _take_fmmu(self, data: bytes) -> None:
         length = int.from_bytes(data[4:6], "little")
+        # From the start bit of the first byte to the stop bit of the last one.
         bits = 8 * (length - 1) - data[6] + data[7] + 1
         if length and bits > 0 and data[11] in {1, 2}:
             place = int.from_bytes(data[8:10], "little"), data[11] == 2
@@ -307,7 +316,8 @@ class _SlaveReader:
 
     def _take_timeout(self, command: XmlElement, at: list[str]) -> None:
         timeout = command.number_at("Validate/Timeout", 0, _U32)
-        # A command for several transitions has the same time-out for each.
+        # A command for several transitions has the same time-out for each.  SAFEOP and OP have one
+        # in ESI files (SafeopOpTimeout): the longer of both.
         for transition, key in (("IP", "preop_ms"), ("SO", "safeop_op_ms"), ("PS", "safeop_op_ms")):
             if transition in at and 0 < timeout <= _MAX_TIMEOUT_MS:
                 state = (_octets(command, "Validate/Data") or b"\0")[0]
@@ -466,6 +476,7 @@ class _SlaveReader:
                 found[number] = EniSyncManager(
                     start=box.number_at("Start", 0, _U16),
                     size=box.number_at("Length", 0, _U16),
+                    # As in ESI files: one mailbox is written by the master, one read.
                     control=(0x26, 0x22)[number],
                     is_output=not number,
                     is_mailbox=True,
@@ -486,11 +497,13 @@ class _SlaveReader:
             if element.tag in _MANAGERS:
                 number = _MANAGERS[element.tag]
                 found[number] = self._manager(element, number, assigns, found.get(number))
+        # The mailboxes of a slave are sync managers 0 and 1.
         first = 2 if any(each.is_mailbox for each in found.values()) else 0
         for (start, is_output), bits in sorted(self._mapped.items()):
             # An FMMU whose sync manager is nowhere in the file.
             if start >= _FIRST_AREA and all(each.start != start for each in found.values()):
                 number = next(each for each in range(first, 64) if each not in found)
+                # Three buffers, as terminals have it; outputs with their watchdog.
                 control = 0x64 if is_output else 0x20
                 found[number] = EniSyncManager(
                     start=start, control=control, is_output=is_output, bits=bits
@@ -536,6 +549,7 @@ class _SlaveReader:
         shift = 0
         if clock is not None:
             low, high = -(1 << 31), _U32
+            # Registers go first: they are what a slave would get.  Times of DC have a sign.
             cycle0 = cycle0 or max(0, clock.number_at("CycleTime0", low, high))
             if _CYCLE0 not in self._times:
                 cycle1 = max(0, clock.number_at("CycleTime1", low, high))

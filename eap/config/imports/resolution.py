@@ -208,6 +208,7 @@ def _readings(subscription: PlannedSubscription) -> Iterator[str]:
     if subscription.publisher is None:
         return
     head, tail = subscription.publisher[:4], subscription.publisher[4:]
+    # TwinCAT gives a system ….1.1, and its first device ….2.1.
     is_system = tail == b"\1\1"
     other = NetId(bytes(head) + (b"\2\1" if is_system else b"\1\1"))
     owner = "system" if is_system else "device"

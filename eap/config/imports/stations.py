@@ -307,12 +307,14 @@ class _StationBuilder:
         router = system
         used.add(system)
         own = [
+            # TwinCAT gives device 1 the NetID ….2.1, and so on.
             each.net_id or _free_net_id(system, 2 + number, used)
             for number, each in enumerate(self._devices)
         ]
         self._check_unique(own, system)
         sent = list(own)
         if identity is PublisherIdentity.SYSTEM and own:
+            # Exchanged, because each NetID is that of one router or port.
             router, sent[0] = own[0], system
         ports = []
         for number, (device, uri) in enumerate(zip(self._devices, uris, strict=True)):
@@ -386,6 +388,7 @@ class _StationBuilder:
                 reasons += why
         if not pds:
             reasons.append("it has no variable that can be sent")
+        # As TwinCAT does it: a group has no single receiver to look for.
         is_monitored = (
             box.is_monitored and _is_unicast(box, to) and port.scheme in {"udp", "ethernet"}
         )
@@ -521,6 +524,7 @@ def is_group_address(text: str) -> bool:
 
 def _vlan(device: EapImportDevice) -> tuple[int, int]:
     """Return the VLAN of a device: that of its first publisher."""
+    # TwinCAT has it at each publisher, a plant file at the port.
     publishers = (each for each in device.boxes if each.is_publisher)
     return next(((each.vlan_id, each.vlan_priority) for each in publishers), (0, 0))
 

@@ -225,6 +225,7 @@ def _publisher(definition: XmlElement) -> EapBox:
         name="",
         is_publisher=True,
         net_id=_net_id(definition.findtext("PublisherNetId"), line),
+        # A MAC address of zeros means unicast to the NetID.
         mac="" if is_udp else _mac(definition.findtext("MacAddress"), line),
         udp=_ip(definition.findtext("Udp/Address"), line) if is_udp else "",
         gateway="" if gateway == _NO_IP else _ip(gateway, line),

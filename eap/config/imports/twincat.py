@@ -346,6 +346,7 @@ class _Project:
 
     def _read_links(self, owner: XmlElement, file: str) -> None:
         """Note the links of one owner; in the file of a device the owner may be that device."""
+        # In the file of a device either side is the owner, and the device itself has no name.
         for other in owner.iterfind("OwnerB" if owner.tag == "OwnerA" else "OwnerA"):
             names = owner.get("Name"), other.get("Name")
             devices = [each for each in names if not each or each.startswith("TIID^")]
@@ -381,6 +382,7 @@ class _Project:
 
     def _cycle_of(self, link: _Link) -> int:
         """Return the cycle of the task that a linked variable belongs to; 0 if it is unknown."""
+        # Group and variable of a PLC: PlcTask Outputs^MAIN.nIndex.
         group = link.symbol.split("^")[0]
         found = self._contexts.get(f"{link.owner}^{group}")
         if found is not None:
@@ -408,6 +410,7 @@ def _variable(element: XmlElement, name: str) -> EapVariable:
         nv_id=element.attribute_number("NvId", 0, MAX_U16),
         type="" if kind is None else kind.text,
         guid="" if kind is None else kind.get("GUID").upper(),
+        # In bytes, with the end of a text: 256 for STRING(255).
         bits=8 * element.attribute_number("NvLength", 0, MAX_U16),
         unknown=tuple(unknown),
         line=element.line,
@@ -442,4 +445,5 @@ def _hex_net_id(text: str, line: int) -> NetId | None:
 def _mac(text: str) -> str:
     """Return the MAC address of 12 hexadecimal digits; empty if it is none."""
     octets = six_bytes(text)
+    # No adapter has a group address.
     return str(MacAddr(octets)) if any(octets) and not octets[0] & 1 else ""

@@ -208,6 +208,7 @@ def _type(element: XmlElement) -> TypeRecord:
     name = element.find("Name")
     if name is None or not name.text:
         raise XmlError("a DataType has no Name", line=element.line, expected="the element Name")
+    # The same element has two names: BaseType in TMC files, Type in TPY files.
     base = element.find("BaseType") or element.find("Type")
     return TypeRecord(
         name=name.text,
@@ -239,6 +240,7 @@ def _member(element: XmlElement) -> MemberRecord:
         raise XmlError(
             "a SubItem has no Name or no Type", line=element.line, expected="both elements"
         )
+    # A few members of real files have none: their type gives the size.
     has_size = element.find("BitSize") is not None
     return MemberRecord(
         name=element.findtext("Name"),
@@ -274,6 +276,7 @@ def _bounds(element: XmlElement) -> tuple[ArrayBound, ...]:
 
 
 def _is_pointer(kind: XmlElement) -> bool:
+    # Noted to be refused: an address means nothing to another controller.
     return bool(kind.get("PointerTo") or kind.get("ReferenceTo"))
 
 

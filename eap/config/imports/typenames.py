@@ -17,6 +17,8 @@ from eap.config.types import ReportedTypeError, TypeTable, definition_of, type_t
 if TYPE_CHECKING:
     from eap.codec.datatypes import DataType
 
+# TwinCAT's BOOL has a byte, that of ETG.1005 one bit.  A BIT has a byte, too: only in structs of
+# the system is it one bit.
 _BIT_TYPES = {"BIT": "BOOL8", "BOOL": "BOOL8"}
 _WIDTH = 100
 
