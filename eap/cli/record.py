@@ -11,7 +11,12 @@ from eap.cli.group import LazyGroup
     cls=LazyGroup,
     commands_at={
         "info": "eap.cli.recordings:info",
+        "list": "eap.cli.recorders:list_recordings",
+        "mark": "eap.cli.recorders:mark",
         "repair": "eap.cli.recordings:repair",
+        "snapshot": "eap.cli.recorders:snapshot",
+        "start": "eap.cli.recorders:start",
+        "stop": "eap.cli.recorders:stop",
     },
 )
 def record() -> None:

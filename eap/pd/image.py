@@ -502,7 +502,7 @@ class ImageSamples:
         """Number of cycles that samples are kept of."""
         return self._slot.count
 
-    def since(self, cycle: int) -> Iterable[int]:
+    def since(self, cycle: int) -> range:
         """Return the cycles behind *cycle* that there may be samples of, the oldest first."""
         newest = self.newest
         if self._heads[self._head(newest)] != newest:

@@ -1,0 +1,204 @@
+"""The process of one recording: its loop, its requests and its end.
+
+``eapctl record start`` starts it in a session of its own, so that it outlives the terminal.  It
+reports on stdout that it records, or why it does not, and closes that.  Requests come by a socket
+in its folder: a JSON line each, answered by one.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from time import monotonic_ns
+
+import msgspec
+
+from eap.errors import EapError
+from eap.recording.recorder import Recorder, RecorderOptions
+from eap.runtime.recordings import RecordingFolder, RecordingState, forget_old_recordings
+
+_CHECK_NS = 500_000_000
+_MAX_LINE = 65_536
+_MAX_CLIENTS = 16
+
+
+class RecorderRequest(msgspec.Struct, kw_only=True):
+    """One request; *do* is ``state``, ``mark``, ``snapshot`` or ``stop``."""
+
+    do: str
+    text: str = ""
+
+
+class RecorderAnswer(msgspec.Struct, kw_only=True, omit_defaults=True):
+    """One answer; *error* is empty if the request was done."""
+
+    state: RecordingState | None = None
+    error: str = ""
+
+
+class RecorderProcess:
+    """Runs *recorder* until it ends, and serves requests.
+
+    Args:
+        recorder: The recording.
+        folder: Its folder, locked.
+    """
+
+    def __init__(self, recorder: Recorder, folder: RecordingFolder) -> None:
+        self._recorder = recorder
+        self._folder = folder
+        self._server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._server.bind(str(folder.control_socket))
+        self._server.listen(_MAX_CLIENTS)
+        self._clients: dict[int, tuple[socket.socket, bytes]] = {}
+        self._waiting: list[tuple[socket.socket, threading.Event]] = []
+        self._ending: list[socket.socket] = []
+        self._stops = False
+
+    def stop(self, number: int, frame: object) -> None:
+        """End the recording in the next look; a signal handler."""
+        del number, frame
+        self._stops = True
+
+    def run(self, report: Callable[[RecorderAnswer], object]) -> int:
+        """Run until the recording ends; return the exit code.
+
+        Args:
+            report: Called once, when it records or waits for its plant, or cannot.
+        """
+        recorder = self._recorder
+        look_ns = check_ns = 0
+        is_reported = False
+        while not recorder.is_over:
+            now_ns = monotonic_ns()
+            if self._stops:
+                recorder.end("stopped", now_ns)
+                break
+            if now_ns >= look_ns:
+                look_ns = recorder.look(now_ns)
+                if not is_reported and recorder.is_settled:
+                    is_reported = True
+                    state = recorder.check(now_ns)
+                    self._folder.write(state)  # for a list that is asked for right after the start
+                    report(RecorderAnswer(state=state))
+            if now_ns >= check_ns:
+                check_ns = now_ns + _CHECK_NS
+                self._folder.write(recorder.check(now_ns))
+            self._serve(min(look_ns, check_ns) - monotonic_ns())
+        state = recorder.check(monotonic_ns())
+        self._folder.write(state)
+        if not is_reported:
+            report(RecorderAnswer(error=state.reason))
+        for client in self._ending:
+            self._answer(client, RecorderAnswer(state=state))
+        return 1 if recorder.has_failed else 0
+
+    def _serve(self, timeout_ns: int) -> None:
+        """Serve requests for *timeout_ns*, or until the first."""
+        descriptors = [self._server.fileno(), *self._clients]
+        readable, _, _ = select.select(descriptors, [], [], max(0, timeout_ns) / 1e9)
+        for fd in readable:
+            if fd == self._server.fileno():
+                self._accept()
+            else:
+                self._read(fd)
+        for client, done in list(self._waiting):
+            if done.is_set():
+                self._waiting.remove((client, done))
+                self._answer(client, RecorderAnswer(state=self._recorder.check(monotonic_ns())))
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            client, _ = self._server.accept()
+            if len(self._clients) >= _MAX_CLIENTS:
+                client.close()
+                return
+            client.setblocking(False)
+            self._clients[client.fileno()] = client, b""
+
+    def _read(self, fd: int) -> None:
+        client, before = self._clients.pop(fd)
+        data = b""
+        with suppress(OSError):
+            data = client.recv(_MAX_LINE)
+        line, end, _ = (before + data).partition(b"\n")
+        if end:
+            self._handle(client, line)
+        elif data and len(line) < _MAX_LINE:
+            self._clients[fd] = client, line
+        else:
+            client.close()
+
+    def _handle(self, client: socket.socket, line: bytes) -> None:
+        recorder, now_ns = self._recorder, monotonic_ns()
+        try:
+            request = msgspec.json.decode(line, type=RecorderRequest)
+            if request.do == "stop":
+                self._ending.append(client)
+                self._stops = True
+                return
+            if request.do == "snapshot":
+                self._waiting.append((client, recorder.snapshot(now_ns)))
+                return
+            if request.do == "mark":
+                recorder.mark(request.text, now_ns)
+            answer = RecorderAnswer(state=recorder.check(now_ns))
+        except (EapError, msgspec.MsgspecError) as exc:
+            answer = RecorderAnswer(error=str(exc))
+        self._answer(client, answer)
+
+    def _answer(self, client: socket.socket, answer: RecorderAnswer) -> None:
+        with suppress(OSError):  # it may have gone
+            client.send(msgspec.json.encode(answer) + b"\n")
+        client.close()
+
+
+def main(arguments: list[str]) -> int:
+    """Record as ``arguments[0]``, RecorderOptions as JSON, says; return the exit code."""
+    options = msgspec.json.decode(arguments[0], type=RecorderOptions)
+    try:
+        folder = RecordingFolder.claim(options.name)
+    except EapError as exc:
+        _report(RecorderAnswer(error=str(exc)))
+        return 2
+    with folder:
+        forget_old_recordings()
+        try:
+            recorder = Recorder(options, monotonic_ns())
+        except EapError as exc:
+            _report(RecorderAnswer(error=str(exc)))
+            return 2
+        recorder.state.pid = os.getpid()
+        folder.write(recorder.state)
+        process = RecorderProcess(recorder, folder)
+        signal.signal(signal.SIGTERM, process.stop)
+        signal.signal(signal.SIGINT, process.stop)
+        _log_to(folder.log)
+        return process.run(_report)
+
+
+def _report(answer: RecorderAnswer) -> None:
+    """Write the outcome of the start, and close stdout: the starter does not wait any more."""
+    with suppress(OSError):
+        os.write(1, msgspec.json.encode(answer) + b"\n")
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 1)
+    os.close(null)
+
+
+def _log_to(path: Path) -> None:
+    """Have what Python reports of an error go to *path*: the starter reads it only at the start."""
+    log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+    os.dup2(log, 2)
+    os.close(log)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

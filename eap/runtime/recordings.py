@@ -1,0 +1,176 @@
+"""Recordings of this user: a folder of each in the runtime directory, by which it is found.
+
+A recorder holds the lock of its folder; the kernel drops that however the recorder ends.  What it
+wrote there last remains, so that a recording that was killed is listed as such.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import struct
+from contextlib import suppress
+from pathlib import Path
+from typing import Self
+
+import msgspec
+
+from eap.closeable import Closeable
+from eap.errors import EnvironmentalError
+from eap.runtime.folder import ApplianceFolder, folder_name, runtime_root, runtime_roots
+
+_FOLDER = ".recordings"
+_FLOCK = struct.Struct("hhqqi4x")
+KEPT = 32
+"""Recordings that ended and are listed; older ones are forgotten, their files are not."""
+
+
+class RecordingState(msgspec.Struct, kw_only=True):
+    """One recording, as its recorder described it last.
+
+    Attributes:
+        name: Its name.
+        kind: ``values`` or ``frames``.
+        plant: The plant.
+        pid: Process id of the recorder.
+        state: ``starting``, ``recording``, ``armed`` (a ring that waits for its condition),
+            ``waiting`` (the plant does not run), ``ended`` or ``killed``.
+        reason: Reason of the end, or of the waiting.
+        started_at: Unix time of the start.
+        ended_at: Unix time of the end.
+        selected: Number of variables or ports.
+        messages: Messages or frames written.
+        octets: Bytes written.
+        lost: Cycles or frames that the recorder missed.
+        triggers: Times at which the condition became true.
+        ring_s: Seconds in memory.
+        ring_is_cut: Whether the ring is shorter than wanted, for want of memory.
+        files: Those that there are, the newest last.
+        options: Of the command.
+    """
+
+    name: str
+    kind: str
+    plant: str
+    pid: int = 0
+    state: str = "starting"
+    reason: str = ""
+    started_at: float = 0.0
+    ended_at: float | None = None
+    selected: int = 0
+    messages: int = 0
+    octets: int = 0
+    lost: int = 0
+    triggers: int = 0
+    ring_s: float | None = None
+    ring_is_cut: bool = False
+    files: list[str] = []
+    options: dict[str, str] = {}
+
+    @property
+    def is_over(self) -> bool:
+        """True if it ended or was killed."""
+        return self.state in {"ended", "killed"}
+
+
+class RecordingFolder(Closeable):
+    """The folder of one recording; its recorder holds the lock until ``close``."""
+
+    def __init__(self, path: Path, lock_fd: int = -1) -> None:
+        self.path = path
+        self._lock_fd = lock_fd
+
+    @classmethod
+    def claim(cls, name: str) -> Self:
+        """Make the folder of the recording *name* and lock it; one that ended is replaced.
+
+        Raises:
+            EnvironmentalError: a recording of that name runs, or the folder cannot be made.
+        """
+        path = runtime_root() / _FOLDER / folder_name(name)
+        try:
+            path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            lock_fd = os.open(path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as exc:
+            raise EnvironmentalError(f"{path}: {exc.strerror}") from None
+        try:
+            # As that of an appliance: a test for it takes no lock, so it never prevents a start.
+            fcntl.fcntl(lock_fd, fcntl.F_OFD_SETLK, _FLOCK.pack(fcntl.F_WRLCK, 0, 0, 0, 0))
+        except BlockingIOError:
+            os.close(lock_fd)
+            raise EnvironmentalError(
+                f"recording {name!r} runs already: choose another name with -o, or end it with"
+                f" 'eapctl record stop {name}'"
+            ) from None
+        folder = cls(path, lock_fd)
+        for entry in path.iterdir():
+            if entry.name != "lock":
+                entry.unlink()
+        return folder
+
+    @property
+    def control_socket(self) -> Path:
+        """Socket that takes requests."""
+        return self.path / "control"
+
+    @property
+    def log(self) -> Path:
+        """Output of the recorder."""
+        return self.path / "log"
+
+    def write(self, state: RecordingState) -> None:
+        """Replace the description in one step."""
+        temporary = self.path / "state.json.new"
+        temporary.write_bytes(msgspec.json.encode(state))
+        temporary.replace(self.path / "state.json")
+
+    def read(self) -> RecordingState:
+        """Return the description; ``killed`` if its recorder has gone without a word.
+
+        Raises:
+            OSError, ValueError: there is none.
+        """
+        is_alive = self.is_alive()
+        state = msgspec.json.decode((self.path / "state.json").read_bytes(), type=RecordingState)
+        if not is_alive and not state.is_over:
+            state.state, state.reason = "killed", f"the recorder was killed{self._last_line()}"
+        return state
+
+    def _last_line(self) -> str:
+        """Return what its recorder wrote last about an error."""
+        with suppress(OSError):
+            lines = self.log.read_text(errors="replace").split("\n")
+            if last := next((each for each in reversed(lines) if each.strip()), ""):
+                return f": {last[:200]}"
+        return ""
+
+    def is_alive(self) -> bool:
+        """Return whether a recorder holds the lock."""
+        return ApplianceFolder(self.path).is_alive()
+
+    def close(self) -> None:
+        """Let go of the lock; the description stays."""
+        if self._lock_fd >= 0:
+            self.control_socket.unlink(missing_ok=True)
+            os.close(self._lock_fd)
+            self._lock_fd = -1
+
+
+def find_recordings() -> list[tuple[RecordingFolder, RecordingState]]:
+    """Return all recordings, those that began first coming first."""
+    found = []
+    for root in runtime_roots():
+        with suppress(OSError):
+            for path in (root / _FOLDER).iterdir():
+                folder = RecordingFolder(path)
+                with suppress(OSError, ValueError):
+                    found.append((folder, folder.read()))
+    return sorted(found, key=lambda each: each[1].started_at)
+
+
+def forget_old_recordings() -> None:
+    """Remove the folders of recordings that ended long ago."""
+    over = [folder for folder, state in find_recordings() if state.is_over]
+    for folder in over[:-KEPT]:
+        shutil.rmtree(folder.path, ignore_errors=True)
