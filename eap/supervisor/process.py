@@ -251,7 +251,6 @@ class Supervisor:
         self._follow_buses()
 
     def _start_segment(self, bus: BusSocket, child: Child) -> None:
-        self._restart_ns.pop(child, None)
         handover = SegmentHandover(
             self._common.supervisor,
             InterfaceUri.parse(bus.interface).host,
@@ -298,6 +297,7 @@ class Supervisor:
     def _start_with(
         self, child: Child, handover: Handover | SegmentHandover, descriptors: list[int]
     ) -> None:
+        self._restart_ns.pop(child, None)
         try:
             child.start(handover, descriptors, self._clock())
         except OSError as exc:

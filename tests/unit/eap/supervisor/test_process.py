@@ -176,6 +176,29 @@ def test_supervisor_tries_again_when_a_process_that_ran_cannot_be_started(
     assert "trying again in 100 ms" in caplog.messages[-1]
 
 
+def test_process_that_starts_again_after_a_pause_is_started_once(stations, monkeypatch):
+    started = []
+
+    def start(self, *_):
+        started.append(self.name)
+
+    with (
+        ApplianceFolder.claim("demo") as folder,
+        SharedSockets(folder.control_socket) as sockets,
+    ):
+        options = EngineOptions(realtime=False)
+        info = make_info("demo", "demo.yaml", stations)
+        supervisor = Supervisor(
+            info, Plant("x", stations), folder, sockets, options=options, clock=lambda: 0
+        )
+        monkeypatch.setattr(Child, "start", start)
+        for child in (supervisor._engine, supervisor._services):
+            supervisor._restart_ns[child] = 0
+        for _ in range(3):
+            supervisor._check_time()
+    assert started == ["engine", "services"]
+
+
 def handover():
     return Handover(1, "/run/x", "demo", "demo.yaml", (left(), right()), ())
 
