@@ -120,10 +120,7 @@ class FakeGateway:
             1001: MailboxServer(servers, sizes),
             0: MailboxServer({MailboxType.COE: master}, large),
         }
-        self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._udp.bind(("127.0.0.1", 0))
-        self.port = self._udp.getsockname()[1]
-        self._tcp = socket.create_server(("127.0.0.1", self.port))
+        self._udp, self._tcp, self.port = _listen()
         self._threads = [
             threading.Thread(target=each) for each in (self._serve_udp, self._serve_tcp)
         ]
@@ -183,6 +180,8 @@ class FakeGateway:
                 connection, _ = self._tcp.accept()
             except OSError:
                 return
+            # Otherwise the second piece waits for the acknowledgement of the first one.
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             with connection, connection.makefile("rwb") as stream:
                 while head := stream.read(2):
                     frame = head + stream.read(int.from_bytes(head, "little") & 0x7FF)
@@ -191,6 +190,20 @@ class FakeGateway:
                     stream.flush()
                     stream.write(answers[5:])
                     stream.flush()
+
+
+def _listen() -> tuple[socket.socket, socket.socket, int]:
+    """Return sockets of UDP and TCP with one port number, and that number."""
+    tcp = socket.create_server(("127.0.0.1", 0))
+    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    port: int = tcp.getsockname()[1]
+    try:
+        udp.bind(("127.0.0.1", port))
+    except OSError:  # a client by UDP has that number
+        udp.close()
+        tcp.close()
+        return _listen()
+    return udp, tcp, port
 
 
 def _frame(header: MailboxHeader, body: bytes | memoryview) -> bytes:

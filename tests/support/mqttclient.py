@@ -37,15 +37,18 @@ class PahoPeer:
         self._client.on_connect = self._subscribe
         self._client.will_set(self._topic(net_id, "info"), self._info("false"), 2, retain=True)
         self._client.connect(address)
+        self._has_left = threading.Event()
+        self._thread = threading.Thread(target=self._run)
 
     def __enter__(self) -> Self:
-        self._client.loop_start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Vanish: the broker publishes the will."""
+        self._has_left.set()
+        self._thread.join()
         self._client._sock_close()
-        self._client.loop_stop()
 
     def wait_for_router(self, net_id: str, name: str | None) -> None:
         """Wait until the router with *net_id* says that it has *name*; None: that it is gone."""
@@ -62,6 +65,10 @@ class PahoPeer:
         """Ask *router*; return the answer."""
         self.publish(router, "ams", self._form(packet))
         return self.answers.get(timeout=PATIENCE_S)
+
+    def _run(self) -> None:
+        while not self._has_left.is_set():  # of paho, loop_stop takes up to a second
+            self._client.loop(timeout=0.02)
 
     def _subscribe(self, *_: object) -> None:
         self._client.subscribe(

@@ -215,28 +215,26 @@ def test_cycle_waiter_serves_readable_descriptors_only(ticker, pipes):
 def test_cycle_waiter_bounds_share_of_endless_descriptor(ticker, pipes, monkeypatch):
     monkeypatch.setattr(module, "WINDOW_NS", 50 * MS)
     monkeypatch.setattr(module, "SHARE_NS", 10 * MS)
-    busy = 0
+    served = []
 
     def never_ready(now_ns):
-        nonlocal busy
-        end_ns = now_ns + MS
-        while time.monotonic_ns() < end_ns:
+        served.append(now_ns)
+        while time.monotonic_ns() < now_ns + MS:
             pass
-        busy += 1
 
     os.write(pipes[0][1], b"x")  # and nobody reads it
     arrivals = CycleWaiter(ticker, {pipes[0][0]: never_ready})
-    end_ns = in_ms(500)
-    cycles = late = 0
-    while time.monotonic_ns() < end_ns:
+    late = 0
+    for _ in range(100):
         due_ns = in_ms(5)
         while not arrivals.wait(due_ns):
             pass
-        cycles += 1
         late += time.monotonic_ns() > due_ns + 20 * MS
-    assert 20 <= busy <= 200
-    assert cycles >= 50
-    assert late <= cycles // 10
+    assert len(served) >= 20
+    # Eleven calls of a millisecond use up the share of a window; these are two windows apart.
+    apart = zip(served, served[22:], strict=False)
+    assert all(later_ns - earlier_ns >= 50 * MS for earlier_ns, later_ns in apart)
+    assert late <= 10
 
 
 def test_a_wait_for_the_next_window_is_no_deadline(ticker, pipes, monkeypatch):

@@ -52,7 +52,7 @@ def test_client_of_a_gateway_that_is_silent_at_address_0_writes_objects_and_idns
         with FakeGateway() as gateway:
             gateway.is_master_silent = True
             place = "127.0.0.1", gateway.port
-            async with AsyncGatewayClient(*place, timeout_s=0.02) as client:
+            async with AsyncGatewayClient(*place, timeout_s=0.01, tries=20) as client:
                 await client.sdo_write(1001, 0x1008, 0, b"y" * 400)
                 await client.idn_write(1001, MODE, bytes((7, 0, 0, 0)))
                 assert await client.sdo_read(1001, 0x1008) == b"y" * 400
@@ -75,9 +75,11 @@ def test_requests_wait_side_by_side(gateway) -> None:
 
 def test_async_client_repeats_lost_datagrams(gateway) -> None:
     async def run() -> None:
-        async with AsyncGatewayClient("127.0.0.1", gateway.port, timeout_s=0.05) as client:
+        place = "127.0.0.1", gateway.port
+        async with AsyncGatewayClient(*place, timeout_s=0.02, tries=50) as client:
             gateway.drop = 2
             assert await client.sdo_read(0, 0x1008) == b"M"
+        async with AsyncGatewayClient(*place, timeout_s=0.05) as client:
             gateway.drop = 3
             with pytest.raises(MailboxTimeoutError):
                 await client.sdo_read(0, 0x1008)

@@ -111,7 +111,9 @@ def test_a_gateway_whose_master_has_no_dictionary(gateway, bus) -> None:
 
 @pytest.fixture
 def silent_at_master(gateway, monkeypatch):
-    monkeypatch.setattr(bus_gateway, "GatewayClient", partial(GatewayClient, timeout_s=0.02))
+    monkeypatch.setattr(
+        bus_gateway, "GatewayClient", partial(GatewayClient, timeout_s=0.01, tries=20)
+    )
     gateway.is_master_silent = True
     with open_gateway("127.0.0.1", gateway.port, tcp=False) as opened:
         yield opened

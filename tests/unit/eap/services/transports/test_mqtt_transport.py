@@ -54,7 +54,7 @@ class Place:
     def knows(self, net_id: NetId) -> bool:
         return self.router.table.find(net_id) is not None
 
-    async def read(self, target: NetId, body: bytes = b"abc", timeout_s: float = 3) -> AmsAnswer:
+    async def read(self, target: NetId, body: bytes = b"abc", timeout_s: float = 20) -> AmsAnswer:
         return await self.router.request(target, DEVICE, AmsCommand.READ, body, timeout_s=timeout_s)
 
 
@@ -103,7 +103,7 @@ def test_service_resumes_when_the_broker_does(tmp_path):
             server.start()
 
             async def is_answered() -> bool:
-                return not (await one.read(TWO)).error_code
+                return not (await one.read(TWO, timeout_s=0.3)).error_code
 
             await until(is_answered)
 
