@@ -3,8 +3,9 @@
 Tests marked ``net`` open sockets and start processes, on fixed addresses; they come after all
 others.  Under xdist, where each file has one worker (``--dist loadfile``), every worker has a
 network namespace of its own where it may make one; without, only one file of ``net`` tests runs at
-a time.  Tests marked ``quiet`` judge time: the other workers wait while one of them is called, not
-while its fixtures are made.
+a time.  There the files of running plants, which mostly wait, are spread among those that compute.
+Tests marked ``quiet`` judge time: the other workers wait while one of them is called, not while its
+fixtures are made.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import gc
+import itertools
 import os
 import shutil
 import signal
@@ -19,7 +21,6 @@ import subprocess
 import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from uuid import uuid4
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -111,12 +112,16 @@ def state_dir_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
         yield
 
 
+_STATES = itertools.count()
+
+
 @pytest.fixture(autouse=True)
-def state_dir(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+def state_dir() -> Iterator[None]:
     """Give each test a place for configurations of its own; it is made when it is needed."""
-    path = tmp_path_factory.getbasetemp() / f"state-{uuid4().hex}"
-    monkeypatch.setenv("EAP_STATE_DIR", str(path))
-    return path
+    before = os.environ["EAP_STATE_DIR"]
+    os.environ["EAP_STATE_DIR"] = f"{before}-{next(_STATES)}"  # monkeypatch takes ten times as long
+    yield
+    os.environ["EAP_STATE_DIR"] = before
 
 
 def pytest_xdist_auto_num_workers() -> int:
@@ -143,6 +148,44 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             limit_s = own.args[0] if own else float(item.config.getini("timeout"))
             item.add_marker(pytest.mark.timeout(limit_s + _TURN_S), append=False)
     items.sort(key=_is_net)
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        _spread(items)
+
+
+def _spread(items: list[pytest.Item]) -> None:
+    """Order files so that no worker computes alone and none begins a long file at the end."""
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    plants = sorted(filter(_runs_plants, files), key=_turn_of)
+    others = [path for path in files if not _runs_plants(path)]
+    share = -(-len(others) // max(len(plants), 1))
+    order = [
+        path
+        for number, plant in enumerate(plants)
+        for path in (plant, *others[number * share : (number + 1) * share])
+    ]
+    items[:] = (item for path in order or files for item in files[path])
+
+
+_LONGEST = """
+solar_line ethernet_pair poll
+discover eap_device routes bus_ports change_plant mqtt paths subscribers processes live_frames
+refusals gateway ring kickcat hostile_hosts trace_hops gateway_elsewhere bus_station
+routes_ethernet scan_plant killed_processes from_twincat mqtt_docs pyads_clients hostile_slaves
+lasting_subscriptions blank_station slaves_by_ads routes_docs connection_limits full_disk
+"""
+"""Files of running plants: with quiet tests, then by their duration, which changes little."""
+
+
+def _runs_plants(path: Path) -> bool:
+    return path.parent.name in {"integration", "interop"}
+
+
+def _turn_of(path: Path) -> int:
+    names = _LONGEST.split()
+    name = path.stem.removeprefix("test_")
+    return names.index(name) if name in names else len(names)
 
 
 gc.disable()  # until all tests are collected: what that makes stays
