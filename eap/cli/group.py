@@ -185,6 +185,7 @@ _COMMANDS = {
     "new": ("plant:new", "Write a plant file to start from."),
     "od": ("od:od", "Read and write the object dictionary of a device."),
     "pd": ("pd:pd", "List, watch and set the process data of running stations."),
+    "plot": ("plot:plot", "Draw values of recordings or of a running station."),
     "plan": ("plant:plan", "Show the differences between a plant file and the running plant."),
     "record": ("record:record", "Record values and frames, and describe recordings."),
     "rollback": ("plant:rollback", "Undo the last change of a running plant."),

@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner, Result
 
 from eap.cli.group import main
@@ -55,3 +56,35 @@ def test_record_info_of_another_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x"
     path.write_text("text")
     assert "neither a recording of values" in run("record", "info", path).stderr
+
+
+def test_plot_fits_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("LINES", "24")
+    path = write_values(tmp_path / "a.mcap")
+    lines = run("plot", path, "island-01/temp", "island-01/axis.on").stdout.splitlines()
+    assert len(lines) <= 23
+    assert max(map(len, lines)) <= 80
+    assert lines[0].split() == ["°C", "island-01/temp", "99.6667"]
+    assert any("⠤" in line or "⠔" in line or "⡠" in line for line in lines)
+    assert "22:13:20" in lines[-1] or ":13:2" in lines[-1]
+
+
+def test_plot_writes_a_picture(tmp_path: Path) -> None:
+    path = write_values(tmp_path / "a.mcap")
+    result = run("plot", path, "temp", "--with", path, "--out", tmp_path / "x.svg")
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert "4 lines" in result.stderr
+    assert (tmp_path / "x.svg").read_text().startswith("<svg")
+
+
+def test_export_prints_rows_and_columns(tmp_path: Path) -> None:
+    path = write_frames(tmp_path / "a.pcapng")
+    result = run("export", path, "--csv", "--json", "island-01/count")
+    assert json.loads(result.stdout) == {
+        "file": str(tmp_path / "a.csv"), "form": "csv", "rows": 300, "columns": 1,
+    }  # fmt: skip
+    lines = run("export", path, "--csv", "-o", "-", "island-01/b", "--until", "+10ms").stdout
+    assert lines.splitlines()[0] == "time_ns,island-01/b"
+    assert len(lines.splitlines()) == 3
+    assert "expected a form" in run("export", path).stderr
