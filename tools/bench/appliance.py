@@ -68,7 +68,7 @@ def running(plant: Path, link: Cable | None, *arguments: str) -> Iterator[dict[s
         runtime.mkdir()
         environment = os.environ | {VARIABLE: str(runtime), STATE_VARIABLE: f"{folder}/state"}
         process = subprocess.Popen(
-            _command(link, "run", str(plant), *arguments),
+            command_in(link, "run", str(plant), *arguments),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=environment,
@@ -120,7 +120,7 @@ def observe(plant: Path, seconds: float, link: Cable | None) -> Observation:
 def status(link: Cable | None, environment: dict[str, str]) -> dict[str, Any]:
     """Return what ``eapctl status`` says of the appliance that runs in *environment*."""
     done = subprocess.run(
-        _command(link, "status", "--json"),
+        command_in(link, "status", "--json"),
         capture_output=True,
         check=True,
         env=environment,
@@ -129,6 +129,7 @@ def status(link: Cable | None, environment: dict[str, str]) -> dict[str, Any]:
     return msgspec.json.decode(done.stdout, type=dict[str, Any])
 
 
-def _command(link: Cable | None, *words: str) -> Sequence[str]:
+def command_in(link: Cable | None, *words: str) -> Sequence[str]:
+    """Return the command line of ``eapctl`` with *words*, run in *link* if given."""
     command = [*_EAPCTL, *words]
     return link.command(0, *command) if link else command

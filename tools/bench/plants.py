@@ -26,6 +26,30 @@ def line(islands: int, cycle_us: int) -> bytes:
     return msgspec.json.format(msgspec.json.encode(plant))
 
 
+def many_values(count: int, cycle_us: int) -> bytes:
+    """Return a plant of one station whose engine computes *count* numbers in each cycle."""
+    names = [f"value{number:03}" for number in range(count)]
+    station = {
+        "name": "values",
+        "net_id": "127.0.9.1.1.1",
+        "ports": [
+            {
+                "name": "eap0",
+                "kind": "eap",
+                "interface": "udp://127.0.9.1",
+                "net_id": "127.0.9.1.2.1",
+            }
+        ],
+        "variables": dict.fromkeys(names, "LREAL"),
+        "sources": {
+            name: {"kind": "sine", "amplitude": 1 + number, "period_ms": 1000 + 7 * number}
+            for number, name in enumerate(names)
+        },
+    }
+    plant = {"plant": "values", "defaults": {"cycle_us": cycle_us}, "stations": [station]}
+    return msgspec.json.format(msgspec.json.encode(plant))
+
+
 def _name(number: int) -> str:
     return f"island-{number:03}"
 
