@@ -358,6 +358,7 @@ class Recorder:
         self._attached = None
         self.state.state = "ended"
         self.state.reason = self._disk.failure or reason
+        self.state.failed = self.has_failed
         self.state.ended_at = (now_ns + unix_offset_ns()) / 1e9
 
     @property

@@ -12,16 +12,18 @@ import shutil
 import struct
 from contextlib import suppress
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import msgspec
 
 from eap.closeable import Closeable
 from eap.errors import EnvironmentalError
+from eap.quantities import count
 from eap.runtime.folder import ApplianceFolder, folder_name, runtime_root, runtime_roots
 
 _FOLDER = ".recordings"
 _FLOCK = struct.Struct("hhqqi4x")
+_THINGS = {"values": "variable", "frames": "port"}
 KEPT = 32
 """Recordings that ended and are listed; older ones are forgotten, their files are not."""
 
@@ -37,6 +39,7 @@ class RecordingState(msgspec.Struct, kw_only=True):
         state: ``starting``, ``recording``, ``armed`` (a ring that waits for its condition),
             ``waiting`` (the plant does not run), ``ended`` or ``killed``.
         reason: Reason of the end, or of the waiting.
+        failed: Whether it ended by a fault.
         started_at: Unix time of the start.
         ended_at: Unix time of the end.
         selected: Number of variables or ports.
@@ -56,6 +59,7 @@ class RecordingState(msgspec.Struct, kw_only=True):
     pid: int = 0
     state: str = "starting"
     reason: str = ""
+    failed: bool = False
     started_at: float = 0.0
     ended_at: float | None = None
     selected: int = 0
@@ -135,6 +139,8 @@ class RecordingFolder(Closeable):
         state = msgspec.json.decode((self.path / "state.json").read_bytes(), type=RecordingState)
         if not is_alive and not state.is_over:
             state.state, state.reason = "killed", f"the recorder was killed{self._last_line()}"
+            state.failed = True
+            state.ended_at = (self.path / "state.json").stat().st_mtime
         return state
 
     def _last_line(self) -> str:
@@ -167,6 +173,39 @@ def find_recordings() -> list[tuple[RecordingFolder, RecordingState]]:
                 with suppress(OSError, ValueError):
                     found.append((folder, folder.read()))
     return sorted(found, key=lambda each: each[1].started_at)
+
+
+SHOWN_S = 3600.0
+"""Time for which a recording that failed is a finding of ``status``."""
+
+
+def recording_findings(plant: str, now_s: float) -> list[dict[str, Any]]:
+    """Return the recordings of *plant* as findings of ``status``; *now_s* is Unix time."""
+    states = [state for _, state in find_recordings() if state.plant == plant]
+    return [finding for state in states if (finding := _finding(state, now_s))]
+
+
+def _finding(state: RecordingState, now_s: float) -> dict[str, Any] | None:
+    severity, advice, since = "info", "", None
+    what = f"{state.state}, {count(state.selected, _THINGS[state.kind])}"
+    if state.is_over:
+        if not state.failed or now_s - (state.ended_at or 0) > SHOWN_S:
+            return None
+        severity, since = "warning", state.ended_at
+        what = f"{state.state}: {state.reason}"
+        advice = "'eapctl record list' shows its files; start another one"
+    elif state.lost:
+        severity, what = "warning", f"{what}, {state.lost} lost"
+        advice = "the machine is too busy for it: record less, or each N-th cycle by --every"
+    elif state.reason:
+        what = f"{what}: {state.reason}"
+    return {
+        "severity": severity,
+        "where": f"recording {state.name}",
+        "what": what,
+        "advice": advice,
+        "since": since,
+    }
 
 
 def forget_old_recordings() -> None:

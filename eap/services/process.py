@@ -38,6 +38,7 @@ from eap.runtime.handover import (
     PortName,
     SocketKind,
 )
+from eap.runtime.recordings import recording_findings
 from eap.runtime.startup import Startup, Step, no_step
 from eap.runtime.store import StationStore, plant_folder
 from eap.services.ads.station_ads import StationAds
@@ -392,6 +393,7 @@ class Services:
                     *route_findings(devices.routers.values()),
                     *interruption_findings(devices.routers.values(), time()),
                     *(row for each in devices.by_station.values() for row in each.findings()),
+                    *recording_findings(self._handover.plant, time()),
                 ],
             }
 
