@@ -252,6 +252,7 @@ class Station:
             elapsed = (now_ns - previous_ns) // self.cycle_ns
             # The counter follows the time: receivers see missing frames, not a restarted sender.
             words[_CYCLE] += elapsed
+            words[StationWord.SAMPLED_UNTIL] += elapsed  # a term, which readers extend
             words[_FUTEX] = words[_CYCLE] & 0xFFFFFFFF  # no cycle is under way
             return int(previous_ns + (elapsed + 1) * self.cycle_ns)
         words[_CYCLE_AT_NS] = 0  # of a time before the host was booted

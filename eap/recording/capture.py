@@ -25,6 +25,7 @@ from eap.pd.layout import ImageLayout
 from eap.pd.quality import tracker_word
 from eap.pd.words import PD_DROP_REASONS, FrameWord, RxWord, StationWord, TxWord
 
+_RESTART_LOOKS = 2
 _HEAD = struct.Struct("<qq")
 """Cycle and Unix time in front of each sample of a block."""
 
@@ -103,6 +104,7 @@ class StationCapture(Closeable):
         self._samples = ImageSamples(self._file.image)
         self._last = self._samples.newest + 1
         self._restarts = self._word(StationWord.RESTARTS)
+        self._looks_since = _RESTART_LOOKS
         self._samples.extend()
         self._is_final = False
 
@@ -130,6 +132,7 @@ class StationCapture(Closeable):
         samples, last, every = self._samples, self._last, self._every
         # Read before the samples: no cycle runs in an image after it was retired.
         self._is_final = self._file.retired
+        was_restarted = self._note_restart()
         parts: list[bytes] = []
         found = samples.since(last)
         expected = 0
@@ -150,7 +153,8 @@ class StationCapture(Closeable):
         if found:
             missed = newest // every - last // every - len(parts) // 2
             if missed > 0:
-                gaps.append(self._gap(missed, first_ns or monotonic_ns() + offset_ns))
+                time_ns = first_ns or monotonic_ns() + offset_ns
+                gaps.append(Gap(self.layout.station, time_ns, missed, is_loss=not was_restarted))
         self._last = newest
         self._samples.extend()
         if not parts:
@@ -181,10 +185,14 @@ class StationCapture(Closeable):
         # A file of a plant that was started again counts from the beginning.
         self._last = min(self._last, self._samples.newest + 1)
 
-    def _gap(self, count: int, time_ns: int) -> Gap:
+    def _note_restart(self) -> bool:
+        """Return whether the engine was started again since one of the last two looks."""
         restarts = self._word(StationWord.RESTARTS)
-        is_loss, self._restarts = restarts == self._restarts, restarts
-        return Gap(self.layout.station, time_ns, count, is_loss)
+        # The engine writes this word before the cycle number; a look may come in between, or
+        # before the first cycle that runs.
+        self._looks_since = self._looks_since + 1 if restarts == self._restarts else 0
+        self._restarts = restarts
+        return self._looks_since < _RESTART_LOOKS
 
     def _word(self, word: StationWord) -> int:
         return int(self._file.image.words[word])

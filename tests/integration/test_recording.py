@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from eap.recording.recording_file import describe
+from eap.recording.recording_file import describe, iso_time, open_recording
 from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
 
 pytestmark = pytest.mark.net
@@ -98,6 +99,8 @@ def test_values_of_every_cycle_are_recorded_until_the_stop(recordings: Recording
     assert (started["state"], started["selected"], started["kind"]) == ("recording", 7, "values")
     recordings.wait_messages("values", 40)
     recordings.appliance.command("record", "mark", "door open")
+    rows = {each["where"]: each["what"] for each in recordings.appliance.status()["findings"]}
+    assert rows["recording values"] == "recording, 7 variables"
     ended = recordings.stop("values")
     assert (ended["state"], ended["lost"]) == ("ended", 0)
     (path,) = ended["files"]
@@ -167,32 +170,36 @@ def test_changed_station_begins_another_file(recordings: Recordings) -> None:
     assert recordings.stop("beside")["lost"] == 0
 
 
-def test_trigger_writes_the_time_before_and_behind_a_fault(recordings: Recordings) -> None:
-    recordings.start(
-        "fault",
-        "--ring",
-        "3s",
-        "--when",
-        "left/level>80 or lost",
-        "--before",
-        "1s",
-        "--after",
-        "1s",
-    )
+def test_trigger_has_every_cycle_before_and_behind_a_fault_at_any_moment(
+    recordings: Recordings,
+) -> None:
+    when = ["--when", "left/level>80 or lost", "--before", "1s", "--after", "1s"]
+    recordings.start("fault", "left", "--ring", "3s", *when)
     assert recordings.state("fault")["state"] == "armed"
-    wait_until(lambda: recordings.state("fault")["ring_s"] >= 1.2)
+    wait_until(lambda: recordings.state("fault")["ring_s"] >= 1.2 + random.random())
     assert recordings.state("fault")["files"] == []
     recordings.appliance.command("pd", "set", "left", "level", "81")
     wait_until(lambda: recordings.state("fault")["files"])
     wait_until(lambda: recordings.state("fault")["state"] == "armed")
     recordings.appliance.command("pd", "set", "left", "level", "5")
     ended = recordings.stop("fault")
+    assert (ended["triggers"], ended["lost"]) == (1, 0)
     (path,) = ended["files"]
-    info = describe(Path(path))
-    assert 2.0 <= info.seconds <= 2.6
-    (event,) = info.events
+    (event,) = describe(Path(path)).events
     assert (event.kind, event.text) == ("trigger", "left/level>80 or lost")
-    assert ended["triggers"] == 1
+    recording = open_recording(Path(path))
+    (source,) = recording.sources
+    columns = [each.name for each in recording.sources[source].columns]
+    rows = list(recording.rows())
+    levels = [row.values[columns.index("left/level")] for row in rows]
+    ticks = [row.values[columns.index("left/ticks")] for row in rows]
+    # The counter of the plant shows that no cycle is missing.
+    assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
+    fault = levels.index(81.0)
+    assert set(levels[:fault]) < {0.0, 5.0}
+    assert rows[fault].time_ns - rows[0].time_ns >= 0.98e9  # a cycle is 10 ms
+    assert rows[-1].time_ns - rows[fault].time_ns >= 0.98e9
+    assert event.time == iso_time(rows[fault].time_ns)
 
 
 def test_snapshot_writes_the_ring_and_goes_on(recordings: Recordings) -> None:
