@@ -153,39 +153,41 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _spread(items: list[pytest.Item]) -> None:
-    """Order files so that no worker computes alone and none begins a long file at the end."""
+    """Order files so that no worker computes alone and none begins a long file at the end.
+
+    Quiet tests come first: later each of them would wait for whatever runs beside it.
+    """
+    items.sort(key=lambda item: not _is_quiet(item))
     files: dict[Path, list[pytest.Item]] = {}
     for item in items:
         files.setdefault(item.path, []).append(item)
-    plants = sorted(filter(_runs_plants, files), key=_turn_of)
-    others = [path for path in files if not _runs_plants(path)]
+    first = [path for path in files if any(map(_is_quiet, files[path]))]
+    rest = [path for path in files if path not in first]
+    plants = sorted(filter(_runs_plants, rest), key=_place)
+    others = [path for path in rest if not _runs_plants(path)]
     share = -(-len(others) // max(len(plants), 1))
-    order = [
-        path
-        for number, plant in enumerate(plants)
-        for path in (plant, *others[number * share : (number + 1) * share])
-    ]
-    items[:] = (item for path in order or files for item in files[path])
+    for number in range(max(len(plants), 1)):
+        first += plants[number : number + 1] + others[number * share : (number + 1) * share]
+    items[:] = (item for path in first for item in files[path])
 
 
-_LONGEST = """
-solar_line ethernet_pair poll
-discover eap_device routes bus_ports change_plant mqtt paths subscribers processes live_frames
-refusals gateway ring kickcat hostile_hosts trace_hops gateway_elsewhere bus_station
-routes_ethernet scan_plant killed_processes from_twincat mqtt_docs pyads_clients hostile_slaves
-lasting_subscriptions blank_station slaves_by_ads routes_docs connection_limits full_disk
-"""
-"""Files of running plants: with quiet tests, then by their duration, which changes little."""
+_LONGEST = (
+    "discover", "eap_device", "routes", "bus_ports", "change_plant", "mqtt", "paths", "subscribers",
+    "processes", "live_frames", "refusals", "gateway", "ring", "kickcat", "hostile_hosts",
+    "trace_hops", "gateway_elsewhere", "bus_station", "routes_ethernet", "scan_plant",
+    "killed_processes", "from_twincat", "mqtt_docs", "pyads_clients", "hostile_slaves",
+    "lasting_subscriptions", "blank_station", "slaves_by_ads", "routes_docs",
+)  # fmt: skip
+"""Files of running plants by their duration; an old order costs little."""
 
 
 def _runs_plants(path: Path) -> bool:
     return path.parent.name in {"integration", "interop"}
 
 
-def _turn_of(path: Path) -> int:
-    names = _LONGEST.split()
+def _place(path: Path) -> int:
     name = path.stem.removeprefix("test_")
-    return names.index(name) if name in names else len(names)
+    return _LONGEST.index(name) if name in _LONGEST else len(_LONGEST)
 
 
 gc.disable()  # until all tests are collected: what that makes stays

@@ -29,6 +29,10 @@ def name(number: int) -> str:
     return f"island-{number:02}"
 
 
+PATIENT = "buttons: {watchdog: {process_data_ms: 0}}"
+"""A cycle that a busy machine delays takes no slave out of OP."""
+
+
 def station(number: int) -> str:
     own = address(number)
     return f"""\
@@ -36,7 +40,8 @@ def station(number: int) -> str:
     net_id: {own}.1.1
     ports:
       - {{name: eap0, kind: eap, interface: "udp://{own}", net_id: {own}.2.1}}
-      - {{name: bus0, kind: bus, interface: "sim://coe.yaml", net_id: {own}.3.1}}
+      - {{name: bus0, kind: bus, interface: "sim://coe.yaml", net_id: {own}.3.1,
+         slaves: {{{PATIENT}}}}}
 """
 
 

@@ -28,6 +28,8 @@ DRIVE = f"{MILL}.3.1", 1001
 SENSOR = f"{SAW}.3.1", 1003
 ROOT = Path(__file__).parents[2]
 BUSES = ROOT / "config" / "buses"
+# Without a watchdog: a cycle that a busy machine delays takes no slave out of OP.
+PATIENT = "watchdog: {process_data_ms: 0}"
 PLANT = f"""\
 plant: slaves
 defaults: {{cycle_us: 25000}}
@@ -36,12 +38,20 @@ stations:
     net_id: {MILL}.1.1
     ports:
       - {{name: eap0, kind: eap, interface: "udp://{MILL}", net_id: {MILL}.2.1}}
-      - {{name: bus0, kind: bus, interface: "sim://{BUSES}/drive.yaml", net_id: {MILL}.3.1}}
+      - name: bus0
+        kind: bus
+        interface: "sim://{BUSES}/drive.yaml"
+        net_id: {MILL}.3.1
+        slaves: {{drive: {{{PATIENT}}}}}
   - name: saw
     net_id: {SAW}.1.1
     ports:
       - {{name: eap0, kind: eap, interface: "udp://{SAW}", net_id: {SAW}.2.1}}
-      - {{name: bus0, kind: bus, interface: "sim://{BUSES}/coe.yaml", net_id: {SAW}.3.1}}
+      - name: bus0
+        kind: bus
+        interface: "sim://{BUSES}/coe.yaml"
+        net_id: {SAW}.3.1
+        slaves: {{buttons: {{{PATIENT}}}}}
 """
 
 

@@ -76,7 +76,7 @@ def patient(call):
     for _ in range(ATTEMPTS - 1):
         try:
             return call()
-        except RuntimeError:
+        except (RuntimeError, kickcat.ErrorAL):  # the latter where it lost frames of a state
             continue
     return call()
 

@@ -332,4 +332,4 @@ def test_rate_of_reads_is_that_of_a_loopback(plc):
     start = time.perf_counter()
     for _ in range(500):
         assert plc.read(0xF005, handle, pyads.PLCTYPE_UDINT) == 70_000
-    assert time.perf_counter() - start < 5.0
+    assert time.perf_counter() - start < 15.0  # of 20 s, if each waited for a late acknowledgement
