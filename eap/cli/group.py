@@ -188,6 +188,7 @@ _COMMANDS = {
     "plot": ("plot:plot", "Draw values of recordings or of a running station."),
     "plan": ("plant:plan", "Show the differences between a plant file and the running plant."),
     "record": ("record:record", "Record values and frames, and describe recordings."),
+    "replay": ("replay:replay", "Send recorded frames or values again as their publishers."),
     "rollback": ("plant:rollback", "Undo the last change of a running plant."),
     "routes": ("routes:routes", "Show, add, remove and test AMS routes; live without a command."),
     "run": ("plant:run", "Run a plant, or some of its stations."),

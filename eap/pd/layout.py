@@ -43,7 +43,7 @@ from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 # Header first, at fixed offsets: a program of another release finds the version, and stops, before
 # it relies on anything else.
 MAGIC = b"EAPIMAGE"
-LAYOUT_VERSION = 4
+LAYOUT_VERSION = 5
 HEADER = struct.Struct("<8sIIQQQ")
 """Magic, layout version, generation, offset and length of the directory, size of the file."""
 WORDS_OFFSET = 64
@@ -140,6 +140,8 @@ class TxSlot(SpecRecord, frozen=True):
     """True if the application can send it."""
     poll_request: str = ""
     """The RxPD that requests it."""
+    period_us: int = 0
+    """Distance of its frames where schedule is its only trigger, else 0."""
 
 
 class RxSlot(SpecRecord, frozen=True):
@@ -339,6 +341,10 @@ def _tx_slots(
     for frame, slot in zip(spec.frames, frames, strict=True):
         for pd in frame.pds:
             trigger = pd.trigger
+            by_schedule = not (trigger.on_change or trigger.event or pd.poll_request)
+            period_us = trigger.cycle_us or spec.cycle_us * (trigger.divider or 1) * (
+                frame.divider or 1
+            )
             yield TxSlot(
                 name=pd.name,
                 frame=frame.name,
@@ -349,10 +355,11 @@ def _tx_slots(
                 variables=pd.variables,
                 words=words.take(TxWord.SIZE),
                 frame_words=slot.words,
-                by_schedule=not (trigger.on_change or trigger.event or pd.poll_request),
+                by_schedule=by_schedule,
                 event=trigger.event,
                 cyclic=bool(trigger.cycle_us) or not (trigger.divider or frame.divider),
                 poll_request=pd.poll_request,
+                period_us=period_us if by_schedule else 0,
             )
 
 

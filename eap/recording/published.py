@@ -18,13 +18,17 @@ from eap.recording.messages import PlacedVariable, RecordedVariable
 
 
 class RecordedPd(Struct, frozen=True, kw_only=True):
-    """One PD: its identification, and its variables in the order of its data."""
+    """One PD: its identification, and its variables in the order of its data.
+
+    *period_us* is the distance of its frames, 0 if it is not sent by a schedule.
+    """
 
     name: str
     pd_id: int
     version: int
     size: int
     variables: tuple[RecordedVariable, ...]
+    period_us: int = 0
 
     def placed(self) -> list[PlacedVariable]:
         """Return the variables with their first bits in the data of the PD."""
@@ -77,6 +81,7 @@ def _frames(layout: ImageLayout) -> Iterable[RecordedFrame]:
                     pd_id=pd.pd_id,
                     version=pd.version,
                     size=pd.size,
+                    period_us=pd.period_us,
                     variables=tuple(
                         RecordedVariable(each, slots[each].type, slots[each].unit)
                         for each in pd.variables
