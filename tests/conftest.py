@@ -202,10 +202,15 @@ def pytest_collection_finish() -> None:
 
 
 class _Turns:
-    """Locks between the workers of xdist: many tests at a time, or one that is alone."""
+    """Locks between the workers of xdist: many tests at a time, or one that is alone.
+
+    Attributes:
+        is_kept: Whether the next test of this worker is to be alone, too.
+    """
 
     def __init__(self) -> None:
         self._is_alone = False
+        self.is_kept = False
 
     def take(self, *, alone: bool) -> None:
         """Wait until a test may run beside others, or *alone*; one that is alone remains so."""
@@ -216,6 +221,12 @@ class _Turns:
         fcntl.flock(_TURN, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
         fcntl.flock(_QUEUE, fcntl.LOCK_UN)
         self._is_alone = alone
+
+    def become_alone(self) -> None:
+        """Wait until no other test runs, and remain alone."""
+        if not self._is_alone:
+            self.give_back()
+            self.take(alone=True)
 
     def give_back(self) -> None:
         """Let others run."""
@@ -237,12 +248,15 @@ def pytest_runtest_protocol(
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return (yield)
     is_alone = _is_net(item) and not _HAS_OWN_NETWORK
+    is_last = nextitem is None or nextitem.path != item.path
+    # What the tests of a file share runs, on fixed addresses, until the last of them is over.
+    # Between two quiet tests all others would have to begin and end one.
+    _TURNS.is_kept = not is_last and (is_alone or (_is_quiet(item) and _is_quiet(nextitem)))
     _TURNS.take(alone=is_alone)
     try:
         return (yield)
     finally:
-        # What the tests of a file share runs, on fixed addresses, until the last of them is over.
-        if not is_alone or nextitem is None or nextitem.path != item.path:
+        if not _TURNS.is_kept:
             _TURNS.give_back()
 
 
@@ -252,13 +266,13 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
     is_alone = _is_net(item) and not _HAS_OWN_NETWORK
     if "PYTEST_XDIST_WORKER" not in os.environ or not _is_quiet(item) or is_alone:
         return (yield)
-    _TURNS.give_back()
-    _TURNS.take(alone=True)
+    _TURNS.become_alone()
     try:
         return (yield)
     finally:
-        _TURNS.give_back()
-        _TURNS.take(alone=False)
+        if not _TURNS.is_kept:
+            _TURNS.give_back()
+            _TURNS.take(alone=False)
 
 
 def _is_quiet(item: pytest.Item) -> bool:
