@@ -6,6 +6,7 @@ import os
 import socket
 import statistics
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -164,10 +165,22 @@ def test_answers_come_back_on_the_connection_of_the_request(farm: Plants) -> Non
             assert set(row["reason"]) == {"poll"}
 
 
-@pytest.mark.quiet
-@pytest.mark.root
-@pytest.mark.parametrize("transport", ["ethernet", "udp"])
-def test_quality_is_the_captured_response_time(farm: Plants, transport: str) -> None:
+class Measured(NamedTuple):
+    """A client and its servers on a cable with a tap.
+
+    Attributes:
+        own: Address of the client in frames.
+    """
+
+    client: Appliance
+    servers: Appliance
+    tap: Wiretap
+    own: str
+
+
+@pytest.fixture(params=["ethernet", "udp"])
+def measured(farm: Plants, request: pytest.FixtureRequest) -> Iterator[Measured]:
+    transport: str = request.param
     line = "ethernet://line0"
     endpoints = {
         "ethernet": over(desk=line, mill=line, lathe=line, to="multicast"),
@@ -182,11 +195,18 @@ def test_quality_is_the_captured_response_time(farm: Plants, transport: str) -> 
         with Wiretap(left.socket(socket.AF_PACKET, socket.SOCK_RAW), "line0") as tap:
             client = farm.run(plant, "--station", "desk", prefix=left.prefix)
             wait_until(lambda: client.rx("desk", "lathe-part")["received"] >= 5)
-            samples = sample(client, SAMPLES)
-            desk = client.station("desk")
-            assert_all_is_well(desk, [servers.station("mill"), servers.station("lathe")])
-            tapped = tap.tapped()
-        own = {"ethernet": left.mac(), "udp": "10.88.164.1:34980"}[transport]
+            own = {"ethernet": left.mac(), "udp": "10.88.164.1:34980"}[transport]
+            yield Measured(client, servers, tap, own)
+
+
+@pytest.mark.quiet
+@pytest.mark.root
+def test_quality_is_the_captured_response_time(measured: Measured) -> None:
+    client, servers, tap, own = measured
+    samples = sample(client, SAMPLES)
+    desk = client.station("desk")
+    assert_all_is_well(desk, [servers.station("mill"), servers.station("lathe")])
+    tapped = tap.tapped()
     requests = [passed for passed in tapped if passed.leaves]
     answers = [passed for passed in tapped if not passed.leaves]
     assert {tuple(passed.pd_ids) for passed in requests} == {(70,)}
