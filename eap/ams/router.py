@@ -89,6 +89,10 @@ class Router:
         """Let services answer for *net_id*; *ports* says at any time which AMS ports it has."""
         self._devices[net_id] = ports
 
+    def remove_device(self, net_id: NetId) -> None:
+        """Remove an own NetID; requests to it are routed as to any other from now on."""
+        del self._devices[net_id]
+
     def add_transport(self, transport: Transport) -> None:
         """Add *transport*; raises ValueError as :meth:`TransportTable.add`."""
         self._transports.add(transport)

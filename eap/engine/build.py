@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import os
-import select
 import socket
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from eap.engine.bus_requests import BusRequestHandler, ServeStation
-from eap.engine.bus_settings import epoch_offset_ns, master_settings
+from msgspec.structs import replace
+
+from eap.engine.bus_requests import BusRequestHandler
 from eap.engine.channels import PortChannels
-from eap.engine.engine_bus import EngineBus
+from eap.engine.engine_buses import EngineBuses
 from eap.engine.frame_taps import FrameRecording
 from eap.engine.rebuild import EngineStation, StationRebuilder
-from eap.ids import InterfaceUri
-from eap.net.busport import BusPort
 from eap.net.framering_file import FrameRingFile
 from eap.net.image_file import create_image
 from eap.pd.engine import Engine
@@ -34,104 +31,8 @@ from eap.runtime.handover import (
     Handover,
     PortName,
 )
-from eap.runtime.passing import PassedConnection, PassedDescriptor
+from eap.runtime.passing import PassedConnection, PassedDescriptor, PassedLine
 from eap.runtime.startup import Step, no_step
-
-REST_NS = 300_000_000
-"""Limit for bringing slaves to INIT when the engine ends."""
-
-
-class EngineBuses:
-    """The buses of *stations*.
-
-    Attributes:
-        buses: By their numbers in requests.
-        requests: Takes requests of services; None in a test without services.
-        arrivals: Callbacks for readable descriptors.
-    """
-
-    def __init__(
-        self,
-        handover: Handover,
-        stations: Mapping[str, EngineStation],
-        serve_station: ServeStation,
-    ) -> None:
-        self._handover = handover
-        self.buses = {
-            given.number: self._make(given, stations[given.owner.station])
-            for given in handover.buses
-        }
-        self.requests: BusRequestHandler | None = None
-        self.arrivals: dict[int, Callable[[int], None]] = {
-            fd: bus.drain for bus in self.buses.values() for fd in bus.filenos()
-        }
-        if handover.bus_fd != NO_DESCRIPTOR:
-            self.requests = BusRequestHandler(socket.socket(fileno=handover.bus_fd), serve_station)
-            self.arrivals[self.requests.fileno()] = self.requests.serve
-            for number, bus in self.buses.items():
-                self.requests.add(number, bus)
-
-    def start(self, now_ns: int) -> None:
-        """Begin to bring all buses up."""
-        if self.requests is not None:
-            self.requests.announce()
-        for bus in self.buses.values():
-            bus.start(now_ns)
-
-    def publish(self) -> None:
-        """Send the changes on the buses to services."""
-        if self.requests is not None:
-            self.requests.publish()
-
-    def rest(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
-        """Bring all slaves to INIT, or as far as they get in REST_NS."""
-        now_ns = clock()
-        # Slaves that do not answer must not delay the end: their watchdogs stop the outputs too.
-        end_ns = now_ns + REST_NS
-        tasks = {bus: bus.shut_down(now_ns) for bus in self.buses.values()}
-        while (now_ns := clock()) < end_ns:
-            waiting = [bus for bus, task in tasks.items() if not task.is_done]
-            if not waiting:
-                return
-            times = [end_ns, *(at for bus in waiting if (at := bus.next_timeout()) is not None)]
-            lines = [fd for bus in waiting for fd in bus.filenos()]
-            select.select(lines, [], [], max(0, min(times) - now_ns) / 1e9)
-            for bus in waiting:
-                bus.drain(clock())
-                bus.handle_timeout(clock())
-
-    def close(self) -> None:
-        """Close all sockets."""
-        for bus in self.buses.values():
-            bus.close()
-        if self.requests is not None:
-            self.requests.close()
-
-    def _make(self, given: BusSocket, entry: EngineStation) -> EngineBus:
-        port = self._handover.port(given.owner)
-        station = entry.station
-        first = BusPort(socket.socket(fileno=given.engine_fd), interface=port.interface.host)
-        second = None
-        if given.second_fd != NO_DESCRIPTOR:
-            redundant = InterfaceUri.parse(port.bus.redundant) if port.bus else port.interface
-            second = BusPort(
-                socket.socket(fileno=given.second_fd),
-                interface=redundant.host,
-                source=first.source,
-            )
-        bus = EngineBus(
-            port,
-            master_settings(port, station.spec.cycle_us, epoch_offset_ns()),
-            station.cycle_ns,
-            station.image,
-            station.memory_of,
-            first,
-            second,
-            entry.set_step,
-        )
-        station.connect_bus(bus)
-        entry.buses[port.name] = bus
-        return bus
 
 
 class EnginePlant:
@@ -174,13 +75,19 @@ class EnginePlant:
         self.engine = Engine([entry.station for entry in self._stations.values()])
         ring = self._resources.enter_context(FrameRingFile(folder.frames))
         self.recording = FrameRecording(ring, self._stations)
-        self.rebuilder = StationRebuilder(self.engine, self._stations, self._channels)
+        step("building buses")
+        self.buses = EngineBuses(self.arrivals, self.engine)
+        self._resources.callback(self.buses.close)
+        for given in handover.buses:
+            self._add_lines(given)
+        for entry in self._stations.values():
+            self.buses.open_all(entry)
+        self.rebuilder = StationRebuilder(self.engine, self._stations, self._channels, self.buses)
         self._resources.callback(self.rebuilder.close)
         self.arrivals[self.rebuilder.fileno()] = self.rebuilder.collect
-        step("building buses")
-        self.buses = EngineBuses(handover, self._stations, self.rebuilder.serve)
-        self._resources.callback(self.buses.close)
-        self.arrivals.update(self.buses.arrivals)
+        if handover.bus_fd != NO_DESCRIPTOR:
+            sock = socket.socket(fileno=handover.bus_fd)
+            self.buses.serve(BusRequestHandler(sock, self.rebuilder.serve))
 
     def start(self, now_ns: int) -> None:
         """Bring all stations to their states, and publish the pid of the engine in their images."""
@@ -191,10 +98,19 @@ class EnginePlant:
 
     def take(self, sock: socket.socket, passed: PassedDescriptor) -> None:
         """Take what services passed: a connection, or a socket for ports that come later."""
-        if isinstance(passed, PassedConnection):
-            self._channels.add_connection(sock, passed, self._handler)
-        else:
-            self._channels.add_socket(passed.socket, sock)
+        match passed:
+            case PassedConnection():
+                self._channels.add_connection(sock, passed, self._handler)
+            case PassedLine():
+                self.buses.add_line(sock, passed)
+            case _:
+                self._channels.add_socket(passed.socket, sock)
+
+    def _add_lines(self, given: BusSocket) -> None:
+        bus = replace(given.key, number=given.number)
+        for is_second, fd in ((False, given.engine_fd), (True, given.second_fd)):
+            if fd != NO_DESCRIPTOR:
+                self.buses.add_line(socket.socket(fileno=fd), PassedLine(bus, is_second))
 
     def image(self, station: str) -> Image:
         """Return the process image of a station as it is now."""

@@ -123,6 +123,10 @@ class BusRequestHandler:
         self._buses[number] = bus, BusPublisher(number, bus, self._send)
         bus.faults.on_unsolicited.append(partial(self._forward, number))
 
+    def remove(self, number: int) -> None:
+        """Refuse requests to the bus numbered *number* from now on; those under way are its own."""
+        del self._buses[number]
+
     def announce(self) -> None:
         """Send the first message of a new engine."""
         self._send(EngineStarted(os.getpid()))
@@ -178,7 +182,7 @@ class BusRequestHandler:
     def _serve_bus(self, request: BusRequest, now_ns: int) -> None:
         self._cancel(request.id)  # a requester that used the number before has gone
         if request.bus not in self._buses:
-            error = BusError(f"there is no bus {request.bus}")
+            error = BusError(f"there is no bus {request.bus}: it was removed from the plant")
             self._send(EngineReply(id=request.id, error=to_record(error)))
             return
         bus, publisher = self._buses[request.bus]
@@ -205,7 +209,8 @@ class BusRequestHandler:
 
     def _reply(self, request: BusRequest, reply: EngineReply) -> None:
         """Reply to a request behind the changes that it made, or its sender has not received."""
-        self._buses[request.bus][1].flush()
+        if request.bus in self._buses:
+            self._buses[request.bus][1].flush()
         self._send(reply)
 
     def _forward(self, bus: int, message: Unsolicited) -> None:

@@ -264,6 +264,11 @@ class EngineBus:
                     break  # the rest was for an engine that has died
         self._guarded(self._start, now_ns)
 
+    def fail_tasks(self, reason: str) -> None:
+        """Fail all requests that are under way."""
+        for task in list(self.tasks):
+            task.fail(BusError(f"{task.name}: {reason}"))
+
     def shut_down(self, now_ns: int) -> Task[None]:
         """Begin to bring all slaves to INIT."""
         self._starting = self._retry_ns = None
@@ -395,8 +400,7 @@ class EngineBus:
         self.is_up = False
         self.refused = ()
         self._start_fault = reason
-        for task in list(self.tasks):
-            task.fail(BusError(f"{task.name}: {reason}"))
+        self.fail_tasks(reason)
 
     def _exchange(self, now_ns: int) -> None:
         self.master.handle_timeout(now_ns)

@@ -132,6 +132,7 @@ def run_cycles(
     try:
         arrivals = CycleWaiter(ticker, plant.arrivals)
         rebuilder.on_swap.append(arrivals.update)
+        plant.buses.on_change.append(arrivals.update)
         rebuilder.receive_sockets = partial(_take_all, plant, link)
         while not stop.is_set:
             if not is_notified and engine.is_under_way:

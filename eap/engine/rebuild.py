@@ -21,6 +21,7 @@ from eap.engine.bus_mapping import BusMapping
 from eap.engine.bus_settings import epoch_offset_ns, master_settings
 from eap.engine.channels import PortChannels, engine_sockets, has_tcp
 from eap.engine.engine_bus import BusSuccessor, EngineBus
+from eap.engine.engine_buses import EngineBuses
 from eap.errors import EapError, EngineRefusedError
 from eap.net import realtime
 from eap.net.image_file import ImageFile, prepare_image
@@ -39,6 +40,7 @@ from eap.pd.spec import PortKind, StationSpec, record_from_lines
 from eap.pd.station import Station
 from eap.runtime.engine_messages import Configure, SetState, StationRequest
 from eap.runtime.handover import PortName, SharedSocket
+from eap.runtime.socket_plan import bus_of
 
 
 class EngineStation:
@@ -74,11 +76,12 @@ class StationReplacement:
         EapError, ValueError, LookupError: the specification is not that of a station.
     """
 
-    def __init__(self, entry: EngineStation, spec: StationSpec) -> None:
+    def __init__(self, entry: EngineStation, spec: StationSpec, buses: EngineBuses) -> None:
         before = entry.station
         if reasons := needs_new_start(before.spec, spec):
             raise EngineRefusedError("\n".join(reasons))
         self._entry = entry
+        self._buses = buses
         self._changes = port_changes(before.spec, spec)
         self._file = prepare_image(entry.file.path, plan_layout(spec), entry.file.generation + 1)
         try:
@@ -95,26 +98,36 @@ class StationReplacement:
             ]
             self._tcp_ports = _new_tcp_ports(entry, spec, self._changes)
             added = {each.name.port: (each.channel, each.groups) for each in self._opened}
-            station.prepare_handover(before, added, self._tcp_ports)
+            self._prepare_buses()
+            station.prepare_handover(before, added, self._tcp_ports, self._connected)
             self._images.commit()
-            memory_of = self._station.memory_of
-            self._mappings: list[tuple[EngineBus, BusMapping]] = []
-            self._restarts: list[tuple[EngineBus, BusSuccessor]] = []
-            self._old_masters: list[Master] = []
-            restarting = restarting_buses(before.spec, spec)
-            for port in spec.ports:
-                bus = entry.buses.get(port.name)
-                if bus is None:
-                    continue
-                if port.name in restarting:
-                    settings = master_settings(port, spec.cycle_us, epoch_offset_ns())
-                    successor = bus.prepare_restart(port, settings, image, memory_of)
-                    self._restarts.append((bus, successor))
-                else:
-                    self._mappings.append((bus, bus.prepare_mapping(port, image, memory_of)))
         except BaseException:
             self.discard()
             raise
+
+    def _prepare_buses(self) -> None:
+        """Make the buses that are new, and the other parts of those that stay."""
+        entry, station = self._entry, self._station
+        spec, image = station.spec, station.image
+        self._connected: list[EngineBus] = []
+        self._added_buses: dict[str, EngineBus] = {}
+        self._mappings: list[tuple[EngineBus, BusMapping]] = []
+        self._restarts: list[tuple[EngineBus, BusSuccessor]] = []
+        self._old_masters: list[Master] = []
+        restarting = restarting_buses(entry.station.spec, spec)
+        for port in spec.ports:
+            if port.bus is None:
+                continue
+            bus = entry.buses.get(port.name)
+            if bus is None or self._buses.key_of(bus) != bus_of(spec.name, port):
+                bus = self._added_buses[port.name] = self._buses.make(entry, station, port)
+            elif port.name in restarting:
+                settings = master_settings(port, spec.cycle_us, epoch_offset_ns())
+                successor = bus.prepare_restart(port, settings, image, station.memory_of)
+                self._restarts.append((bus, successor))
+            else:
+                self._mappings.append((bus, bus.prepare_mapping(port, image, station.memory_of)))
+            self._connected.append(bus)
 
     @property
     def is_current(self) -> bool:
@@ -155,6 +168,9 @@ class StationReplacement:
         entry.file.wake_waiters()
         entry.file.close()
         entry.file, entry.station = self._file, station
+        gone = [bus for bus in entry.buses.values() if bus not in self._connected]
+        if gone or self._added_buses:
+            self._buses.exchange(entry, gone, self._added_buses, now_ns)
         return before
 
     def discard(self) -> None:
@@ -201,7 +217,9 @@ class _Job:
         sockets: Those that the ports of the requested specification need.
     """
 
-    def __init__(self, entry: EngineStation, request: Configure, reply: Reply) -> None:
+    def __init__(
+        self, entry: EngineStation, request: Configure, reply: Reply, buses: EngineBuses
+    ) -> None:
         self.entry = entry
         self.request = request
         self.reply = reply
@@ -210,6 +228,7 @@ class _Job:
         self.is_built = False
         self.is_stale = False
         self.sockets: list[SharedSocket] = []
+        self._buses = buses
         self._before: Station | None = None
         self._taken = threading.Lock()
 
@@ -254,7 +273,7 @@ class _Job:
             spec = _read(self.request)
             self.sockets = engine_sockets(spec)
             if spec != self.entry.station.spec:
-                self.successor = StationReplacement(self.entry, spec)
+                self.successor = StationReplacement(self.entry, spec, self._buses)
         except EngineRefusedError as exc:
             self.error = exc
         except Exception as exc:  # noqa: BLE001  no specification may end the engine
@@ -279,8 +298,13 @@ class StationRebuilder:
     """
 
     def __init__(
-        self, engine: Engine, stations: dict[str, EngineStation], channels: PortChannels
+        self,
+        engine: Engine,
+        stations: dict[str, EngineStation],
+        channels: PortChannels,
+        buses: EngineBuses,
     ) -> None:
+        self._buses = buses
         self._engine = engine
         self._stations = stations
         self._channels = channels
@@ -323,7 +347,7 @@ class StationRebuilder:
             reply(EngineRefusedError(f"{MAX_WAITING} changes wait already"))
         else:
             self.receive_sockets()
-            self._waiting.append(_Job(entry, request, reply))
+            self._waiting.append(_Job(entry, request, reply, self._buses))
             if self._thread is None:
                 self._begin(self._waiting.popleft())
 
@@ -356,6 +380,7 @@ class StationRebuilder:
         gc.freeze()
         if not job.is_stale:
             self._channels.close_unused(job.sockets)
+            self._buses.close_unused(job.entry.station.spec.name)
             for notify in self.on_swap:
                 notify()
             job.reply(job.error)

@@ -22,6 +22,7 @@ class Engine:
         self._stations = list(stations)
         self._arrivals: list[FrameChannel] = []
         self._buses: list[CyclicBus] = []
+        self._others: list[CyclicBus] = []
         self._due: list[tuple[int, int]] = []
 
     def drain_on_arrival(self, channels: Iterable[FrameChannel]) -> None:
@@ -30,7 +31,7 @@ class Engine:
 
     def start(self, now_ns: int, states: Mapping[str, DeviceState] = MappingProxyType({})) -> None:
         """Bring all stations, with their present buses, to Op or to their state in *states*."""
-        self._buses = [bus for station in self._stations for bus in station.buses]
+        self._find_buses()
         self._due = [
             (station.start(now_ns, states.get(station.spec.name, DeviceState.OP)), index)
             for index, station in enumerate(self._stations)
@@ -42,11 +43,21 @@ class Engine:
         """True if every station has run a cycle since the start, or has one beyond SOON_NS."""
         return all(each.has_run or each.cycle_ns > SOON_NS for each in self._stations)
 
+    def run_also(self, buses: Iterable[CyclicBus]) -> None:
+        """Run the timers of *buses* that no station has, and of no others without a station."""
+        self._others = list(buses)
+        self._find_buses()
+
+    def _find_buses(self) -> None:
+        self._buses = [bus for station in self._stations for bus in station.buses]
+        self._buses += self._others
+
     def replace(self, old: Station, new: Station, now_ns: int) -> None:
-        """Run *new*, which has the buses of *old*, in its place; its cycle counter continues."""
+        """Run *new* in the place of *old*; its cycle counter continues."""
         # The index in `_due` stays valid, so the heap is untouched unless the cycle time changes.
         index = self._stations.index(old)
         self._stations[index] = new
+        self._find_buses()
         if new.cycle_ns != old.cycle_ns:
             by_station = {number: due_ns for due_ns, number in self._due}
             # Counted from the last cycle that ran, so that the first new interval is one new cycle

@@ -22,7 +22,7 @@ from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxSlot
 from eap.pd.monitor import SubscriberPresence
-from eap.pd.spec import BusPortSpec, GatewaySpec, PortKind, PortSpec, StationSpec, Writer
+from eap.pd.spec import PortKind, PortSpec, StationSpec, Writer
 from eap.pd.words import (
     REASON_INDEX,
     TRACKER_START,
@@ -35,8 +35,6 @@ from eap.pd.words import (
 
 _IN_FRAMES = {"net_id", "eap_sm", "length"}
 """Fields of a port that only concern the content of its frames."""
-_FIXED_OF_GATEWAY = ("port", "full", "padded")
-"""Fields of a gateway that concern its sockets and the dictionary of its master."""
 _OWN_WORDS = {
     StationWord.FUTEX,
     StationWord.ENGINE_SEQUENCE,
@@ -351,53 +349,33 @@ def describe_port_changes(old: StationSpec, new: StationSpec) -> Iterator[str]:
 
 def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
     """Return the differences that the engine cannot apply while it runs, one line each."""
-    found = []
-    if old.name != new.name:
-        found.append(f"station {old.name} cannot become {new.name}")
-    before = {port.name: port for port in old.ports}
-    after = {port.name: port for port in new.ports}
-    buses = {port.name for port in (*old.ports, *new.ports) if port.kind is PortKind.BUS}
-    found += [f"port {name} is new" for name in after if name in buses - before.keys()]
-    found += [f"port {name} is gone" for name in before if name in buses - after.keys()]
-    for name, port in after.items():
-        if name in before and name in buses:
-            found += [f"port {name}: {what}" for what in _port_differences(before[name], port)]
-    return [f"{line}: restart the appliance" for line in found]
+    if old.name == new.name:
+        return []
+    return [f"station {old.name} cannot become {new.name}: restart the appliance"]
 
 
 def _port_differences(old: PortSpec, new: PortSpec) -> Iterator[str]:
     was = asdict(old)
     for field, value in asdict(new).items():
-        if field == "gateway":
-            yield from _gateway_differences(old.gateway or GatewaySpec(), value or GatewaySpec())
-        elif field == "bus":
-            yield from _bus_differences(old.bus or BusPortSpec(), value or BusPortSpec())
-        elif field not in _IN_FRAMES and value != was[field]:
+        if field not in _IN_FRAMES and value != was[field]:
             yield f"{field} {was[field]} -> {value}"
-
-
-def _bus_differences(old: BusPortSpec, new: BusPortSpec) -> Iterator[str]:
-    if old.redundant != new.redundant:
-        yield f"redundant {old.redundant or 'none'} -> {new.redundant or 'none'}"
-    if old.simulated != new.simulated:
-        yield f"{new.file or old.file} simulates other slaves"
-
-
-def _gateway_differences(old: GatewaySpec, new: GatewaySpec) -> Iterator[str]:
-    for field in _FIXED_OF_GATEWAY:
-        was, value = getattr(old, field), getattr(new, field)
-        if was != value:
-            yield f"gateway.{field} {was} -> {value}"
 
 
 def restarting_buses(old: StationSpec, new: StationSpec) -> set[str]:
     """Return the bus ports whose slaves go to INIT and are brought up with other settings."""
-    before = {port.name: port.bus for port in old.ports if port.bus is not None}
+    # The path of the file alone changes nothing at the slaves.
+    before, after = (
+        {
+            port.name: (port.interface, replace(port.bus, file=""))
+            for port in spec.ports
+            if port.bus is not None
+        }
+        for spec in (old, new)
+    )
+    is_other_cycle = old.cycle_us != new.cycle_us
     return {
-        port.name
-        for port in new.ports
-        if port.bus is not None and (was := before.get(port.name)) is not None
-        # The path of the file alone changes nothing at the slaves.
-        if replace(was, file="") != replace(port.bus, file="")
-        or (port.bus.has_sync and old.cycle_us != new.cycle_us)
+        name
+        for name, (interface, bus) in after.items()
+        if name in before
+        and (before[name] != (interface, bus) or (is_other_cycle and bus.has_sync))
     }

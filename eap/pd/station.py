@@ -307,6 +307,7 @@ class Station:
         before: Station,
         added: Mapping[str, tuple[FrameChannel, Sequence[FrameChannel]]] = MappingProxyType({}),
         channels: Mapping[str, FrameChannel] = MappingProxyType({}),
+        buses: Sequence[CyclicBus] | None = None,
     ) -> None:
         """Connect like *before*, and learn the frames that it receives.
 
@@ -316,6 +317,7 @@ class Station:
             before: The station in use.
             added: Channel and groups of each port that is new, or replaces another of its name.
             channels: Other channels of ports that stay.
+            buses: Those that take part in its cycle; None for those of *before*.
         """
         for port, was in before._ports.items():
             if port in self._subscribers and port not in added:
@@ -326,7 +328,7 @@ class Station:
         for port, (channel, groups) in added.items():
             self.connect(port, channel, groups)
         self._added = frozenset(added)
-        for bus in before.buses:
+        for bus in before.buses if buses is None else buses:
             self.connect_bus(bus)
         for port, subscriber in self._subscribers.items():
             if port not in added:
@@ -347,7 +349,7 @@ class Station:
         self._taps = before._taps
         self._connect_senders()
         for port, requests in self._requests.items():
-            if port not in self._added:
+            if port not in self._added and port in before._requests:
                 requests.follow(before._requests[port])
         for name in self._polls.keys() & before._polls.keys():
             self._polls[name].follow(before._polls[name])

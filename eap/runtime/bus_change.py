@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import msgspec
 
 from eap.codec.soe import Idn
-from eap.ids import ObjectId
+from eap.ids import NetId, ObjectId
 from eap.od.slave_config import (
     BY_SERIAL,
     ID_REGISTER,
@@ -17,7 +18,15 @@ from eap.od.slave_config import (
     SlaveConfig,
 )
 from eap.pd.handover import restarting_buses
-from eap.pd.spec import BusPortSpec, BusSlaveSpec, StationSpec
+from eap.pd.spec import (
+    BusPortSpec,
+    BusSlaveSpec,
+    EoeSpec,
+    GatewaySpec,
+    PortKind,
+    PortSpec,
+    StationSpec,
+)
 
 _NONE = "none"
 _LONGEST = 60
@@ -30,17 +39,27 @@ _OF_PORT = (
 
 def describe_bus_changes(old: StationSpec, new: StationSpec) -> Iterator[str]:
     """Yield the effect on each bus that changes, and what changes there, a line each."""
-    before = {port.name: port.bus for port in old.ports if port.bus is not None}
+    before = {port.name: port for port in old.ports if port.kind is PortKind.BUS}
+    after = {port.name: port for port in new.ports if port.kind is PortKind.BUS}
     restarting = restarting_buses(old, new)
-    for port in new.ports:
-        if port.name not in restarting or port.bus is None:
+    for name in before.keys() - after.keys():
+        yield f"{name}: removed, its slaves go to INIT"
+    for name, port in after.items():
+        bus, was = port.bus or BusPortSpec(), before.get(name)
+        if was is None:
+            yield f"{name}: added at {port.interface}, {len(bus.slaves)} slaves go to {bus.target}"
             continue
-        yield f"{port.name} restarts: its slaves go to INIT, and to {port.bus.target} again"
-        was = before[port.name]
-        if old.cycle_us != new.cycle_us and port.bus.has_sync:
-            yield f"{port.name}: cycle_us {old.cycle_us} -> {new.cycle_us}"
-        yield from _differences(port.name, _of_port(was), _of_port(port.bus))
-        yield from _slave_changes(port.name, was, port.bus)
+        old_bus = was.bus or BusPortSpec()
+        if name in restarting:
+            yield f"{name} restarts: its slaves go to INIT, and to {bus.target} again"
+        elif opening_of(was) != opening_of(port):
+            yield f"{name}: its gateway and ADS ports are opened again, its slaves go on"
+        yield from _differences(name, _of_services(was), _of_services(port))
+        if name in restarting:
+            if old.cycle_us != new.cycle_us and bus.has_sync:
+                yield f"{name}: cycle_us {old.cycle_us} -> {new.cycle_us}"
+            yield from _differences(name, _of_port(was), _of_port(port))
+            yield from _slave_changes(name, old_bus, bus)
 
 
 def _slave_changes(port: str, old: BusPortSpec, new: BusPortSpec) -> Iterator[str]:
@@ -66,8 +85,40 @@ def _shortened(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
-def _of_port(bus: BusPortSpec) -> dict[str, str]:
-    return {key: str(getattr(bus, key)) for key in _OF_PORT}
+def _of_port(port: PortSpec) -> dict[str, str]:
+    bus = port.bus or BusPortSpec()
+    found = {"interface": str(port.interface), "redundant": bus.redundant or _NONE}
+    if bus.simulated:
+        found["simulated slaves"] = f"version {bus.simulated[:8]}"
+    return found | {key: str(getattr(bus, key)) for key in _OF_PORT}
+
+
+class BusOpening(NamedTuple):
+    """Values of a bus port for which, if one changes, its services are opened anew."""
+
+    net_id: NetId
+    own_port: int
+    is_full: bool
+    is_padded: bool
+    eoe: EoeSpec | None
+
+
+def opening_of(port: PortSpec) -> BusOpening:
+    """Return these values of a bus port."""
+    gateway = port.gateway or GatewaySpec()
+    return BusOpening(port.net_id, gateway.port, gateway.full, gateway.padded, port.eoe)
+
+
+def _of_services(port: PortSpec) -> dict[str, str]:
+    """Return what services adds to a bus beside its gateway, whose settings have own lines."""
+    eoe = port.eoe
+    interface = _NONE if eoe is None else f"{eoe.interface} {eoe.address}".strip()
+    found = {"net_id": str(port.net_id), "eoe": interface}
+    if eoe is not None:
+        found["eoe connects"] = "all" if eoe.connects_all else "named slaves"
+    for slave in () if eoe is None else eoe.slaves:
+        found[f"eoe of {slave.slave}"] = slave.ip or "connected"
+    return found
 
 
 def _of_slave(slave: BusSlaveSpec) -> dict[str, str]:

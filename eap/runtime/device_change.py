@@ -140,7 +140,7 @@ def plan_rollback(
 
 def find_refusals(old: StationSpec, new: StationSpec) -> list[str]:
     """Return the changes that a running station cannot make; any of them prevents all others."""
-    before = {port.name: port.net_id for port in old.ports}
+    before = {port.name: port.net_id for port in old.ports if port.kind is PortKind.EAP}
     net_ids = [("the station's router", old.net_id, new.net_id)]
     net_ids += [
         (f"port {port.name}", before[port.name], port.net_id)
@@ -149,11 +149,23 @@ def find_refusals(old: StationSpec, new: StationSpec) -> list[str]:
     ]
     refused = needs_new_start(old, new)
     refused += [f"{line}: restart the appliance" for line in describe_port_changes(old, new)]
+    was_at, is_at = _gateway_ports(old), _gateway_ports(new)
+    refused += [
+        f"port {name}: gateway.port {was_at.get(name, 0)} -> {is_at.get(name, 0)}: restart the"
+        " appliance"
+        for name in dict.fromkeys((*was_at, *is_at))
+        if was_at.get(name, 0) != is_at.get(name, 0)
+    ]
     return refused + [
         f"{what}: net_id {was} -> {becomes}: restart the appliance"
         for what, was, becomes in net_ids
         if was != becomes
     ]
+
+
+def _gateway_ports(spec: StationSpec) -> dict[str, int]:
+    """Return the number of the socket that each gateway has to itself."""
+    return {port.name: port.gateway.port for port in spec.ports if port.gateway is not None}
 
 
 def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:

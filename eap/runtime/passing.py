@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from typing import TypeAlias, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from eap.pd.spec import SpecRecord
 from eap.runtime.handover import BusSocket, PortName, SharedSocket
@@ -41,7 +42,14 @@ class PassedSocket(SpecRecord, frozen=True, tag="socket", tag_field="pass"):
     socket: SharedSocket
 
 
-PassedDescriptor: TypeAlias = PassedConnection | PassedSocket
+class PassedLine(SpecRecord, frozen=True, tag="line", tag_field="pass"):
+    """The engine's socket of a line of a bus; an engine that has it closes the other descriptor."""
+
+    bus: BusSocket
+    is_second: bool = False
+
+
+PassedDescriptor: TypeAlias = PassedConnection | PassedSocket | PassedLine
 """Message of services to the engine, with one descriptor."""
 
 
@@ -74,13 +82,14 @@ class OpenBus(SpecRecord, frozen=True, tag="open-bus", tag_field="do"):
     bus: BusSocket
 
 
-class CloseBus(SpecRecord, frozen=True, tag="close-bus", tag_field="do"):
-    """Close the lines of a bus, which no port uses any more; not answered."""
+class KeepBuses(SpecRecord, frozen=True, tag="keep-buses", tag_field="do"):
+    """Close the lines of all buses of a station but these; not answered."""
 
-    bus: BusSocket
+    station: str
+    buses: tuple[BusSocket, ...]
 
 
-SupervisorRequest: TypeAlias = OpenSocket | CloseSocket | OpenBus | CloseBus
+SupervisorRequest: TypeAlias = OpenSocket | CloseSocket | OpenBus | KeepBuses
 """Message of services to the supervisor."""
 
 
@@ -137,6 +146,15 @@ def pass_connection(
 def pass_socket(link: socket.socket, shared: SharedSocket, sock: socket.socket) -> bool:
     """Send the engine's socket of a pair; return whether there was room for it."""
     return pass_descriptors(link, PassedSocket(shared.key), [sock.fileno()])
+
+
+def pass_bus(link: socket.socket, bus: BusSocket, lines: Sequence[int]) -> bool:
+    """Send the sockets of one or two lines of *bus*; return whether there was room for them."""
+    numbered = replace(bus.key, number=bus.number)
+    return all(
+        pass_descriptors(link, PassedLine(numbered, is_second=bool(index)), [fd])
+        for index, fd in enumerate(lines)
+    )
 
 
 def receive_passed(link: socket.socket) -> tuple[socket.socket, PassedDescriptor] | None:

@@ -33,7 +33,6 @@ from eap.release import RELEASE
 from eap.runtime.drop_counters import DropCounters
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import (
-    NO_DESCRIPTOR,
     Handover,
     PortName,
     SocketKind,
@@ -42,8 +41,9 @@ from eap.runtime.recordings import recording_findings
 from eap.runtime.startup import Startup, Step, no_step
 from eap.runtime.store import StationStore, plant_folder
 from eap.services.ads.station_ads import StationAds
+from eap.services.bus_table import BusFollower, BusTable
 from eap.services.control.audit import Audit, AuditFile
-from eap.services.control.bus_methods import Buses, GatewayMethods
+from eap.services.control.bus_methods import Buses, GatewayMethods, bus_reports
 from eap.services.control.control_ads import ControlAds, RemoteControl
 from eap.services.control.control_server import ControlServer
 from eap.services.control.device_methods import DeviceMethods
@@ -61,7 +61,7 @@ from eap.services.device.sources import SourcePlayer
 from eap.services.device.station_device import StationDevice
 from eap.services.device.station_keeper import EngineClient, StationEngine, StationKeeper
 from eap.services.engine_link import EngineLink
-from eap.services.limited_log import LimitedLogHandler, caused_by
+from eap.services.limited_log import LimitedLogHandler
 from eap.services.routing.route_rows import (
     RouterView,
     interruption_findings,
@@ -70,16 +70,14 @@ from eap.services.routing.route_rows import (
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes, access_of, make_router
 from eap.services.routing.station_routing import StationRouting
-from eap.services.slaves.bus_client import BusClient, open_buses
-from eap.services.slaves.segment_link import SegmentLink
 from eap.services.sockets import Network, open_transports
+from eap.services.supervisor_link import SupervisorLink
+from eap.services.tasks import keep_serving
 from eap.services.transports.accepting import Listeners
 from eap.services.transports.station_brokers import StationBrokers
 
 if TYPE_CHECKING:
-    from eap.services.device.master_values import MasterDictionaryProvider
     from eap.services.gateway.gateway import MailboxGateway
-    from eap.services.slaves.eoe_bridge import EoeBridge
 
 
 _LATELY_NS = 2_000_000_000
@@ -104,6 +102,7 @@ class StationDevices:
         routing: Routing configuration in force, by station.
         brokers: Connections to MQTT brokers, by station; not open yet.
         keepers: Configurations that the stations run, by station.
+        specs: What the stations run, by station.
         ads: ADS services at the NetIDs of routers and EAP ports, by station.
     """
 
@@ -124,6 +123,7 @@ class StationDevices:
         self.routing: dict[str, StationRouting] = {}
         self.brokers: dict[str, StationBrokers] = {}
         self.keepers: dict[str, StationKeeper] = {}
+        self.specs: dict[str, StationSpec] = {}
         self.ads: dict[str, StationAds] = {}
         self._players: list[SourcePlayer] = []
         self._release = release
@@ -168,6 +168,8 @@ class StationDevices:
         player = SourcePlayer(station, image)
         keeper.on_change.append(player.change)
         self.keepers[name] = keeper
+        self.specs[name] = station
+        keeper.on_change.append(partial(self.specs.__setitem__, name))
         self._players.append(player)
         identity = DeviceIdentity(
             device_name=f"EAP station {name}",
@@ -208,8 +210,6 @@ def _runs(image: StationImage) -> bool:
 STATUS_TIMEOUT_S = 0.3
 """Time limit of ``status`` for the engine's report of its buses."""
 _IMAGE_PAUSE_S = 0.01
-_RETRY_S = 1.0
-"""Pause after an error of a socket."""
 
 logger = logging.getLogger(__name__)
 
@@ -248,42 +248,43 @@ class Services:
         self._resources.callback(link.close)
         devices = self._devices(images, link)
         self._startup.step("opening gateways and sockets")
-        clients = open_buses(link, self._handover.buses)
-        providers, gateways = self._gateways(clients, devices)
+        audit = self._audit(devices.routers)
+        buses = self._bus_table(link, devices, audit)
         network = Network(
             self._handover,
             devices.routers,
             {name: each.routes for name, each in devices.routing.items()},
-            gateways,
+            buses.gateways,
             self._counters,
             self._listeners,
             self._resources,
         )
         transports = open_transports(network, self._link)
-        bridges = self._bridges(clients)
         brokers = self._brokers(devices)
-        audit = self._audit(devices.routers, gateways)
-        buses = self._buses(clients, devices, providers)
-        methods = self._methods(images, buses, devices, gateways, audit)
+        methods = self._methods(images, buses, devices, audit)
         remote = RemoteControl(methods.call, devices.routers)
         for name, router in devices.routers.items():
             router.add_service(router.net_id, ControlAds(name, remote))
-        server = ControlServer(methods, buses, audit.write_request, announce=audit.begin_request)
+        reachable = Buses(devices.specs, buses.clients, buses.segments)
+        server = ControlServer(
+            methods, reachable, audit.write_request, announce=audit.begin_request
+        )
         watch = SubscriberWatch(images, open_subscriber_probes(self._handover, self._resources))
         on_sockets: list[Callable[[], Awaitable[None]]] = [
             partial(server.serve, self._listener, self._listeners),
             self._listeners.serve,
-            *(each.serve for each in (*transports, *brokers, *bridges)),
+            *(each.serve for each in (*transports, *brokers)),
             watch.run,
         ]
         async with asyncio.TaskGroup() as group:
-            tasks = [group.create_task(_keep_serving(serve)) for serve in on_sockets]
+            tasks = [group.create_task(keep_serving(serve)) for serve in on_sockets]
             tasks += [group.create_task(each.serve()) for each in (devices, audit, self._log)]
             self._startup.finish({})
             await self._stopping.wait()
             # Cancel rather than raise: the TaskGroup then waits until all connections are closed.
             for task in tasks:
                 task.cancel()
+        await buses.close()
 
     async def _open_image(self, station: str) -> StationImage:
         """Open one image; at the first start the engine creates it meanwhile.
@@ -319,57 +320,17 @@ class Services:
         gc.freeze()  # each collection would scan these objects, while clients wait
         return devices
 
-    def _gateways(
-        self, clients: Mapping[PortName, BusClient], devices: StationDevices
-    ) -> tuple[Mapping[PortName, MasterDictionaryProvider], Mapping[PortName, MailboxGateway]]:
-        if not self._handover.buses:
-            return {}, {}
-        # Imported here: a plant without buses starts with about 76 modules fewer.
-        from eap.services.gateway.opening import (
-            GatewayFollower,
-            open_dictionaries,
-            open_gateways,
-        )
-
-        providers = open_dictionaries(self._handover, clients, RELEASE)
-        gateways = open_gateways(self._handover, clients, providers, devices.routers)
-        for station in self._handover.stations:
-            names = [owner for owner in gateways if owner.station == station.name]
-            mine = {owner.port: gateways[owner] for owner in names}
-            if mine:
-                devices.keepers[station.name].on_change.append(
-                    GatewayFollower(station, mine).change
-                )
-        return providers, gateways
-
     def _brokers(self, devices: StationDevices) -> list[StationBrokers]:
         """Open those that are configured now, which the plant file may not have."""
         for name, brokers in devices.brokers.items():
             brokers.open(devices.routing[name].routes.spec, partial(self._counters.count, name))
         return [*devices.brokers.values()]
 
-    def _bridges(self, clients: Mapping[PortName, BusClient]) -> list[EoeBridge]:
-        found = []
-        for owner, client in clients.items():
-            # Imported here: a plant without buses does not need it.
-            from eap.services.slaves.unsolicited_log import log_unsolicited_pdos
-
-            log_unsolicited_pdos(client)
-            if (spec := self._handover.port(owner).eoe) is not None:
-                # Imported here: few plants use EoE.
-                from eap.services.slaves.eoe_bridge import EoeBridge
-
-                bridge = EoeBridge(client, spec)
-                client.report_eoe = bridge.report
-                found.append(bridge)
-        return found
-
     def _methods(
         self,
         images: dict[str, StationImage],
-        buses: Buses,
+        buses: BusTable,
         devices: StationDevices,
-        gateways: Mapping[PortName, MailboxGateway],
         audit: Audit,
     ) -> Methods:
         meter = ProcessMeter()
@@ -379,7 +340,7 @@ class Services:
         identity = {"release": RELEASE, "plant": self._handover.plant, "pid": os.getpid()}
 
         async def status() -> dict[str, Any]:
-            reports = await buses.reports(STATUS_TIMEOUT_S)
+            reports = await bus_reports(buses.clients, STATUS_TIMEOUT_S)
             return appliance_status(
                 self._folder.read_info(),
                 [await take_snapshot(each.image) for each in images.values()],
@@ -402,7 +363,8 @@ class Services:
             images,
             status=SharedAnswer(status).get,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
-            more=self._more_methods(devices) | GatewayMethods(self._handover, gateways).table(),
+            more=self._more_methods(devices)
+            | GatewayMethods(self._handover, buses.gateways).table(),
         )
 
     def _more_methods(self, devices: StationDevices) -> dict[str, Callable[[dict[str, Any]], Any]]:
@@ -419,9 +381,7 @@ class Services:
             **AmsMethods(devices.routers, self._directory, self._ams_addresses()).table(),
         }
 
-    def _audit(
-        self, routers: Mapping[str, StationRouter], gateways: Mapping[PortName, MailboxGateway]
-    ) -> Audit:
+    def _audit(self, routers: Mapping[str, StationRouter]) -> Audit:
         file = AuditFile(plant_folder(self._handover.plant) / "audit.jsonl")
         is_required = self._handover.audit_required
         audit = Audit(file, self._directory, is_required=is_required)
@@ -429,11 +389,21 @@ class Services:
             router.on_audit.append(partial(audit.write, name))
             if is_required:
                 router.require_record(partial(audit.begin, name))
-        for owner, gateway in gateways.items():
-            gateway.admission.on_audit.append(partial(audit.write, owner.station))
-            if is_required:
-                gateway.admission.before_change = partial(audit.begin, owner.station)
         return audit
+
+    def _bus_table(self, link: EngineLink, devices: StationDevices, audit: Audit) -> BusTable:
+        def audit_gateway(owner: PortName, gateway: MailboxGateway) -> None:
+            gateway.admission.on_audit.append(partial(audit.write, owner.station))
+            if self._handover.audit_required:
+                gateway.admission.before_change = partial(audit.begin, owner.station)
+
+        supervisor = SupervisorLink(socket.socket(fileno=self._handover.supervisor_fd))
+        self._resources.callback(supervisor.close)
+        table = BusTable(link, self._link, supervisor, devices.routers, audit_gateway)
+        table.start(self._handover.stations, self._handover.buses)
+        for name, keeper in devices.keepers.items():
+            keeper.followers.append(BusFollower(table, name, devices.specs))
+        return table
 
     def _ams_addresses(self) -> dict[str, str]:
         """Return the first AMS/TCP address of each station."""
@@ -443,39 +413,6 @@ class Services:
                 for owner in shared.owners:
                     found.setdefault(owner.station, shared.address)
         return found
-
-    def _buses(
-        self,
-        clients: Mapping[PortName, BusClient],
-        devices: StationDevices,
-        providers: Mapping[PortName, MasterDictionaryProvider],
-    ) -> Buses:
-        handover = self._handover
-        segments: dict[PortName, SegmentLink] = {}
-        if not handover.buses:
-            return Buses(handover.stations, clients, segments)
-        # Imported here: a plant without buses does not need them.
-        from eap.services.ads.bus_ads import BusService
-        from eap.services.ads.slave_notifications import SamplingBudget
-
-        budget = SamplingBudget()
-        for bus in handover.buses:
-            if bus.command_fd != NO_DESCRIPTOR:
-                segments[bus.owner] = SegmentLink(socket.socket(fileno=bus.command_fd))
-                self._resources.callback(segments[bus.owner].close)
-            net_id = handover.port(bus.owner).net_id
-            router = devices.routers[bus.owner.station]
-            service = BusService(
-                clients[bus.owner],
-                net_id,
-                RELEASE,
-                router.send_notification,
-                providers[bus.owner],
-                budget,
-            )
-            router.add_service(net_id, service)
-            router.add_fault_finder(net_id, clients[bus.owner].find_faults)
-        return Buses(handover.stations, clients, segments)
 
 
 def main(handover_fd: int, startup: Startup) -> int:
@@ -494,17 +431,3 @@ def main(handover_fd: int, startup: Startup) -> int:
         sys.stderr.write(f"services: {exc}\n")
         return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1
     return 0
-
-
-async def _keep_serving(serve: Callable[[], Awaitable[None]]) -> None:
-    """Call *serve* again after an error of a socket, which must end neither it nor this process."""
-    while True:
-        try:
-            await serve()
-        except* OSError as group:
-            error = group.exceptions[0]
-            cause = caused_by(("socket", str(error)), "sockets")
-            logger.exception("socket error, trying again: %s", error, extra=cause)
-        else:
-            return
-        await asyncio.sleep(_RETRY_S)

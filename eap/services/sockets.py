@@ -28,7 +28,7 @@ from eap.pd.link import FrameOrigin
 from eap.pd.spec import StationSpec
 from eap.runtime.drop_counters import DropCounters, DropReason
 from eap.runtime.handover import NO_DESCRIPTOR, Handover, PortName, SharedSocket, SocketKind
-from eap.services.gateway.gateway_transport import GatewayTransport
+from eap.services.gateway.gateway_transport import GatewayTable, GatewayTransport
 from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes
@@ -48,7 +48,7 @@ from eap.services.transports.mailbox_frames import (
 from eap.services.transports.mailbox_stream import LARGEST_FRAME, MailboxStreams, TcpTransport
 
 if TYPE_CHECKING:
-    from eap.services.gateway.gateway import MailboxGateway
+    pass
 
 AMS_TRANSPORT = TransportKind.AMS_TCP
 """Name of the transport of all clients that connect to AMS/TCP."""
@@ -71,8 +71,8 @@ class Network(NamedTuple):
     """Of the stations, by name."""
     routes: Mapping[str, StationRoutes]
     """Of these routers; tools may add some."""
-    gateways: Mapping[PortName, MailboxGateway]
-    """To the buses, in their order."""
+    gateways: GatewayTable
+    """To the buses."""
     counters: DropCounters
     """Of dropped frames and closed connections."""
     listeners: Listeners
@@ -91,20 +91,14 @@ class Network(NamedTuple):
 
     def first_gateways(self, kind: str, owners: Sequence[PortName]) -> GatewayTransport:
         """Return the gateways of the first bus of each station of *owners*."""
-        first: dict[str, MailboxGateway] = {}
-        for owner, gateway in self.gateways.items():
-            first.setdefault(owner.station, gateway)
-        names = _transport_names(kind, owners)
-        return GatewayTransport(
-            [(first[station], name) for station, name in names.items() if station in first]
-        )
+        return GatewayTransport(self.gateways, _transport_names(kind, owners))
 
     def own_gateway(self, kind: str, shared: SharedSocket) -> GatewayTransport:
         """Return the gateway that has a port number to itself."""
         (owner,) = shared.owners
         spec = next(each for each in self.handover.stations if each.name == owner.station)
         name = next(port.name for port in spec.ports if port.interface.host == shared.address)
-        return GatewayTransport([(self.gateways[owner], f"{kind}:{name}")])
+        return GatewayTransport(self.gateways, {owner.station: f"{kind}:{name}"}, owner)
 
     def drop_counter(self, stations: Sequence[str]) -> Callable[[DropReason], None]:
         """Return the function that counts a reason at each of *stations*."""

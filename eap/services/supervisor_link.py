@@ -7,14 +7,18 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from time import monotonic_ns
 from typing import TypeAlias
 
+from msgspec.structs import replace
+
 from eap.errors import EnvironmentalError
-from eap.runtime.handover import SharedSocket
+from eap.runtime.handover import BusSocket, SharedSocket
 from eap.runtime.passing import (
     CloseSocket,
+    KeepBuses,
+    OpenBus,
     OpenSocket,
     SupervisorReply,
     SupervisorRequest,
@@ -53,19 +57,34 @@ class SupervisorLink:
         Raises:
             EnvironmentalError: it cannot be opened, or the supervisor does not answer.
         """
-        found = await self.request(lambda number: OpenSocket(number, wanted.key))
+        _, found = await self.request(lambda number: OpenSocket(number, wanted.key))
         key = wanted.key
         return SharedSocket(
             key.kind, key.address, key.port, key.group, key.vlan_id, wanted.owners, **found
         )
+
+    async def open_bus(self, wanted: BusSocket) -> BusSocket:
+        """Return *wanted* with its number and descriptors, which the caller closes.
+
+        Raises as :meth:`open`, also if its slaves cannot be simulated.
+        """
+        reply, found = await self.request(lambda number: OpenBus(number, wanted.key))
+        return replace(wanted.key, number=reply.number, **found)
+
+    def keep_buses(self, station: str, buses: Iterable[BusSocket]) -> None:
+        """Have the supervisor close all buses of *station* but these."""
+        # As in close_socket.
+        pass_descriptors(self._socket, KeepBuses(station, tuple(each.key for each in buses)), [])
 
     def close_socket(self, shared: SharedSocket) -> None:
         """Have the supervisor close a socket that no process uses any more."""
         # If there is no room, the next services process has it closed.
         pass_descriptors(self._socket, CloseSocket(shared.key), [])
 
-    async def request(self, make: Callable[[int], SupervisorRequest]) -> dict[str, int]:
-        """Send the request that *make* returns for its number; return the named descriptors.
+    async def request(self, make: Callable[[int], SupervisorRequest]) -> _Received:
+        """Send the request that *make* returns for its number; return the reply.
+
+        The named descriptors come with it.
 
         Raises:
             EnvironmentalError: it failed, or the supervisor does not answer.
@@ -84,7 +103,7 @@ class SupervisorLink:
             del self._waiting[number]
         if reply.error:
             raise EnvironmentalError(reply.error)
-        return descriptors
+        return reply, descriptors
 
     def close(self) -> None:
         """Close the local end; the loop may have ended."""

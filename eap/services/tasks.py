@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, TypeVar
 
 from eap.control.protocol import ErrorCode
 from eap.errors import ControlError
+from eap.services.limited_log import caused_by
 
 T = TypeVar("T")
 
@@ -66,6 +67,24 @@ class TaskSet:
     def _report(self, task: asyncio.Task[Any]) -> None:
         if not task.cancelled() and (exc := task.exception()) is not None:
             logger.error("%s: a task failed", self._name, exc_info=exc)
+
+
+_RETRY_S = 1.0
+"""Pause after an error of a socket."""
+
+
+async def keep_serving(serve: Callable[[], Awaitable[None]]) -> None:
+    """Call *serve* again after an error of a socket, which must end neither it nor this process."""
+    while True:
+        try:
+            await serve()
+        except* OSError as group:
+            error = group.exceptions[0]
+            cause = caused_by(("socket", str(error)), "sockets")
+            logger.exception("socket error, trying again: %s", error, extra=cause)
+        else:
+            return
+        await asyncio.sleep(_RETRY_S)
 
 
 MAX_WAITING = 256

@@ -42,8 +42,8 @@ from eap.runtime.handover import (
     SocketKind,
 )
 from eap.runtime.passing import (
-    CloseBus,
     CloseSocket,
+    KeepBuses,
     OpenBus,
     OpenSocket,
     SupervisorRequests,
@@ -144,8 +144,8 @@ class SharedSockets(Closeable):
             match request:
                 case CloseSocket():
                     self._close(request.socket.key)
-                case CloseBus():
-                    self._close(request.bus.key)
+                case KeepBuses():
+                    self._keep_buses(request)
                 case _:
                     try:
                         self._serve(request)
@@ -238,6 +238,12 @@ class SharedSockets(Closeable):
                 self._buses[key] = replace(bus, number=self._last_bus)
                 self._owned[key] = opened.pop_all()
         return self._buses[key]
+
+    def _keep_buses(self, request: KeepBuses) -> None:
+        kept = {bus.key for bus in request.buses}
+        for key in [*self._buses]:
+            if key.owner.station == request.station and key not in kept:
+                self._close(key)
 
     def _take_waiting(self, bus: BusSocket) -> list[int]:
         numbers = [number for number, key in self._waiting.items() if key == bus.key]

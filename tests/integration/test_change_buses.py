@@ -170,6 +170,59 @@ def test_bus_goes_to_another_target(works: Works) -> None:
     assert works.states()["bus1.state"] == 8
 
 
+def test_simulated_slaves_are_exchanged_and_come_back(works: Works) -> None:
+    before = works.undisturbed()
+    with_file = DRIVE.replace("slaves:", "slaves:\n  - {name: coupler, kind: coupler}")
+    works.farm.write(with_file, "drive.yaml")
+    lines = works.plan()
+    assert lines[1] == "  * bus0 restarts: its slaves go to INIT, and to OP again"
+    assert "  * bus0.coupler: added, station address 1001" in lines
+    assert "  * bus0.drive: station address 1001 -> 1002" in lines
+    works.apply()
+    works.wait_op("bus0")
+    assert [each["name"] for each in works.report("bus0")["slaves"]] == ["coupler", "drive"]
+    assert works.states()["bus0.coupler.state"] == 8
+    for process in PROCESSES:
+        pid = works.appliance.pid(process)
+        os.kill(pid, signal.SIGKILL)
+        works.appliance.wait_for_another(process, pid)
+        works.wait_op("bus0", "bus1")
+        assert [each["name"] for each in works.report("bus0")["slaves"]] == ["coupler", "drive"]
+    works.roll_back()
+    works.wait_op("bus0")
+    assert [each["name"] for each in works.report("bus0")["slaves"]] == ["drive"]
+    assert "bus0.coupler.state" not in works.states()
+    if before[1:3] != works.undisturbed()[1:3]:  # the kill of the engine made another master
+        assert works.report("bus1")["is_up"]
+
+
+def test_optional_slave_is_added_by_the_bus_file(works: Works) -> None:
+    before = works.undisturbed()
+    optional = """\
+  - name: spare
+    kind: digital
+    outputs: [{name: lamp}]
+    master: {optional: true}
+"""
+    works.farm.write(DRIVE + optional, "drive.yaml")
+    assert "  * bus0.spare: added, optional, station address 1002" in works.plan()
+    works.apply()
+    works.wait_op("bus0")
+    wait_until(lambda: works.states()["bus0.spare.state"] == 8)
+    works.eapctl("pd", "set", "press", "bus0.spare.lamp", "true")
+    assert works.undisturbed() == before
+
+
+def test_broken_bus_file_is_refused(works: Works) -> None:
+    before = works.undisturbed()
+    works.farm.write(DRIVE.replace("kind: drive", "kind: dryve"), "drive.yaml")
+    done = run_eapctl(works.appliance.runtime, "apply", str(works.file))
+    assert done.returncode
+    assert "drive.yaml:3" in done.stderr
+    assert works.states()["bus0.state"] == 8
+    assert works.undisturbed() == before
+
+
 def test_invalid_settings_change_nothing(works: Works) -> None:
     before = works.report("bus0")["frames_sent"], works.undisturbed()
     works.write(PLANT.replace(OF_DRIVE, MODE.replace("value: 1", "value: 800")))

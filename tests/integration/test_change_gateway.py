@@ -127,8 +127,19 @@ def test_addresses_limits_and_state_follow_the_file(appliance: Appliance, file: 
 
 
 def test_what_needs_a_restart_is_named(appliance: Appliance, file: Path) -> None:
-    write(file, "{full: true, port: 34999}")
+    write(file, "{port: 34999}")
     answer = said(appliance, "apply", str(file))
     assert "! port bus0: gateway.port 0 -> 34999: restart the appliance" in answer
-    assert "! port bus0: gateway.full False -> True: restart the appliance" in answer
     assert "no station changed" in answer
+
+
+def test_gateway_opens_again_for_a_full_dictionary(appliance: Appliance, file: Path) -> None:
+    write(file, "{full: true}")
+    assert "its gateway and ADS ports are opened again, its slaves go on" in said(
+        appliance, "plan", str(file)
+    )
+    appliance.command("apply", str(file))
+    assert product() == OWN
+    write(file, "{}")
+    appliance.command("apply", str(file))
+    assert product() == OWN

@@ -177,7 +177,6 @@ def test_impossible_plant_is_refused_and_the_old_keeps_running(plant: Appliance)
             ports=(replace(eap0, interface=InterfaceUri.parse(f"udp://{own_address(2)}")), bus0),
         ),
         replace(spec, ports=(replace(eap0, tcp=True), bus0)),
-        replace(spec, ports=(eap0,)),
         replace(spec, subscriptions=(replace(spec.subscriptions[0], variables=("nothing",)),)),
     ):
         try:

@@ -29,16 +29,15 @@ from eap.pd.spec import (
 )
 from eap.pd.words import RxWord, StationWord
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo
-from eap.runtime.handover import BusSocket, PortName
-from eap.services.control.bus_methods import Buses
+from eap.runtime.handover import PortName
+from eap.services.control.bus_methods import Buses, bus_reports
 from eap.services.control.control_server import ControlServer
 from eap.services.control.methods import Methods
 from eap.services.control.status import ProcessMeter, appliance_status
 from eap.services.engine_link import EngineLink
-from eap.services.slaves.bus_client import open_buses
 from eap.services.slaves.segment_link import SegmentLink
 from eap.services.transports.accepting import Listeners
-from tests.support.fakeengine import FakeBus, FakeEngine, FakeSegment
+from tests.support.fakeengine import FakeBus, FakeEngine, FakeSegment, bus_clients
 from tests.support.loopbus import LoopBus
 
 
@@ -172,13 +171,13 @@ class Appliance:
         }
         link = EngineLink(engine.services)
         links = {port: SegmentLink(segment.services) for port, segment in segments.items()}
-        numbered = [BusSocket(port, number) for number, port in enumerate(self._ports)]
-        buses = Buses(tuple(self._specs.values()), open_buses(link, numbered), links)
+        clients = bus_clients(link, *self._ports)
+        buses = Buses(self._specs, clients, links)
         meter = ProcessMeter()
         images = [each.image for each in self.images.values()]
 
         async def status() -> dict[str, Any]:
-            reports = await buses.reports(1)
+            reports = await bus_reports(clients, 1)
             return appliance_status(self.info, images, {}, meter, reports)
 
         methods = Methods({"plant": self.info.plant}, self.images, status=status, stop=lambda: None)

@@ -42,6 +42,8 @@ from eap.runtime.engine_messages import (
     UnsolicitedMessage,
 )
 from eap.runtime.handover import PortName
+from eap.services.engine_link import EngineLink
+from eap.services.slaves.bus_client import BusClient
 from tests.support.loopbus import LoopBus
 
 PORT = PortName("left", "bus0")
@@ -308,3 +310,8 @@ class FakeSegment:
         except ValueError as exc:
             answer |= {"ok": False, "error": str(exc)}
         self.say(answer)
+
+
+def bus_clients(link: EngineLink, *ports: PortName) -> dict[PortName, BusClient]:
+    """Return clients of the buses of a fake engine, in their order."""
+    return {port: BusClient(link, number, port) for number, port in enumerate(ports)}

@@ -11,6 +11,7 @@ from time import perf_counter_ns
 from typing import Any, NamedTuple
 
 from eap.engine.channels import PortChannels
+from eap.engine.engine_buses import EngineBuses
 from eap.engine.rebuild import EngineStation, StationReplacement
 from eap.ids import InterfaceUri
 from eap.net.image_file import create_image
@@ -118,7 +119,7 @@ def _swaps(pds: int) -> list[Change]:
 def _change(place: EngineStation, engine: Engine, spec: Any) -> Change:
     engine.handle_timeout(engine.next_timeout())
     times = [perf_counter_ns()]
-    successor = StationReplacement(place, spec)
+    successor = StationReplacement(place, spec, EngineBuses({}, Engine([])))
     times.append(perf_counter_ns())
     before = successor.take_over(engine, engine.next_timeout() - 1)
     times.append(perf_counter_ns())

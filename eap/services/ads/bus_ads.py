@@ -155,6 +155,10 @@ class SlaveAds:
         """End the notifications of a connection that is closed."""
         self._notifications.client_gone(endpoint)
 
+    async def close(self) -> None:
+        """End all notifications."""
+        await self._notifications.close()
+
     def _name_of(self, station: int) -> str:
         """Return the name of a slave with that of its bus."""
         slave = self._bus.view.latest.slaves.get(station)
@@ -470,6 +474,11 @@ class BusService:
         result = int.from_bytes(answer.data[:_RESULT_SIZE], "little")
         # Routers put errors of the route into the AMS header, and clients look for them there.
         return AmsAnswer(error_code=result, why=answer.why) if result in _IN_HEADER else answer
+
+    async def close(self) -> None:
+        """End all notifications: the bus is gone."""
+        await self._master.close()
+        await self._slaves.close()
 
     def client_gone(self, endpoint: Endpoint) -> None:
         """Remove the notifications of a closed connection; files stay open for another one."""

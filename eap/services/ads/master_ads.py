@@ -196,6 +196,10 @@ class MasterAds:
         """End the notifications of a connection that is closed."""
         self._device.notifications.forget(endpoint)
 
+    async def close(self) -> None:
+        """End all notifications."""
+        await self._sender.close()
+
     async def _send_commands(self, operation: ReadWrite) -> bytes:
         commands = RawCommands(operation.data)
         check_up(self._bus.name, await self._view.current())
@@ -238,6 +242,10 @@ class NotificationSender:
     def _start(self) -> None:
         if self._task is None or self._task.done():
             self._task = self._tasks.start(self._run())
+
+    async def close(self) -> None:
+        """Send nothing any more."""
+        await self._tasks.close()
 
     async def _run(self) -> None:
         while (due_ns := self._table.next_timeout()) is not None:

@@ -307,6 +307,13 @@ class _SlaveSampler:
             value.table.forget(endpoint)
         self._drop_ended()
 
+    async def close(self) -> None:
+        """End all notifications."""
+        for _, client in self.by_handle.values():
+            self._budget.release(client)
+        self.by_handle.clear()
+        await self._tasks.close()
+
     def _drop_ended(self) -> None:
         """Release notifications that their tables no longer have, and values without any."""
         for handle, (value, client) in list(self.by_handle.items()):
@@ -436,6 +443,11 @@ class SlaveNotifications:
         if sampler is None:
             raise AdsRefusedError(AdsError.NOTIFICATION_HANDLE)
         sampler.delete(client, handle)
+
+    async def close(self) -> None:
+        """End all notifications."""
+        for sampler in self._samplers.values():
+            await sampler.close()
 
     def client_gone(self, endpoint: Endpoint) -> None:
         """End the notifications of a connection that is closed."""

@@ -8,7 +8,7 @@ too.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from inspect import isawaitable
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from eap.errors import ControlError, EapError
 from eap.pd.spec import PortKind, StationSpec
 from eap.runtime.engine_messages import BusReport
 from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.services.gateway.gateway_transport import GatewayTable
 from eap.services.slaves.bus_client import BusClient, MailboxLock
 from eap.services.slaves.segment_link import SegmentLink
 from eap.suggest import suggest
@@ -36,34 +37,20 @@ class Buses:
     """The buses of the appliance, for all connections.
 
     Args:
-        stations: Those that run here.
+        stations: Specifications of those that run here, by name.
         clients: One for each bus.
         segments: Take commands, one for each simulated bus.
     """
 
     def __init__(
         self,
-        stations: Sequence[StationSpec],
+        stations: Mapping[str, StationSpec],
         clients: Mapping[PortName, BusClient],
         segments: Mapping[PortName, SegmentLink],
     ) -> None:
         self._clients = clients
-        self._stations = {station.name: station for station in stations}
+        self._stations = stations
         self._segments = segments
-
-    async def reports(self, timeout_s: float) -> dict[PortName, BusReport]:
-        """Return the reports of all buses that the engine describes in time."""
-        found: dict[PortName, BusReport] = {}
-        answers = await asyncio.gather(
-            *(client.describe(timeout_s) for client in self._clients.values()),
-            return_exceptions=True,
-        )
-        for port, answer in zip(self._clients, answers, strict=True):
-            if isinstance(answer, BusReport):
-                found[port] = answer
-            elif not isinstance(answer, EapError):
-                raise answer
-        return found
 
     def find(self, wanted: records.BusParameters) -> BusClient:
         """Return the bus that parameters name; raise ControlError with the names there are."""
@@ -85,6 +72,24 @@ class Buses:
         except KeyError:
             reason = f"{port.station}/{port.port} is not simulated: nothing can be changed there"
             raise ControlError(reason, code=ErrorCode.REFUSED) from None
+
+
+async def bus_reports(
+    clients: Mapping[PortName, BusClient], timeout_s: float
+) -> dict[PortName, BusReport]:
+    """Return the reports of all buses that the engine describes in time."""
+    # A copy: buses may come and go meanwhile.
+    asked = dict(clients)
+    found: dict[PortName, BusReport] = {}
+    answers = await asyncio.gather(
+        *(client.describe(timeout_s) for client in asked.values()), return_exceptions=True
+    )
+    for port, answer in zip(asked, answers, strict=True):
+        if isinstance(answer, BusReport):
+            found[port] = answer
+        elif not isinstance(answer, EapError):
+            raise answer
+    return found
 
 
 class _OpenMailbox:
@@ -248,12 +253,16 @@ class GatewayMethods:
 
     Args:
         handover: Where they are served.
-        gateways: All of them, in the order of the buses.
+        gateways: All of them.
     """
 
-    def __init__(self, handover: Handover, gateways: Mapping[PortName, MailboxGateway]) -> None:
+    def __init__(self, handover: Handover, gateways: GatewayTable) -> None:
         self._handover = handover
-        self._gateways = gateways
+        self._table = gateways
+
+    @property
+    def _gateways(self) -> Mapping[PortName, MailboxGateway]:
+        return self._table.by_port
 
     def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         """Return the methods by name."""

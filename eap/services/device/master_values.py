@@ -93,6 +93,7 @@ class MasterDictionaryProvider:
         dictionary: To be served after :attr:`refresh`.
         refresh: Refreshes the values that the object at an index shows.
         is_fresh: Returns whether the object at an index may be read at once.
+        close: Ends what writes to the dictionary have begun.
     """
 
     def __init__(
@@ -104,7 +105,7 @@ class MasterDictionaryProvider:
         padded: bool = False,
     ) -> None:
         view = MasterView(bus)
-        self.refresh, self.is_fresh = view.refresh, view.is_fresh
+        self.refresh, self.is_fresh, self.close = view.refresh, view.is_fresh, view.close
         identity = DeviceIdentity(
             device_name=f"EtherCAT master {bus.name}",
             hardware_version=os.uname().machine,
@@ -211,6 +212,10 @@ class MasterView:
                 await self._view.current()
             for value, age_s in self._values_behind(index):
                 await value.refresh(age_s)
+
+    async def close(self) -> None:
+        """End the scans and changes of states that are under way."""
+        await self._tasks.close()
 
     def is_fresh(self, index: int) -> bool:
         """Return whether :meth:`refresh` has nothing to do."""

@@ -98,6 +98,19 @@ class StationEngine(Protocol):
         """Bring *station* to PreOp, SafeOp or Op."""
 
 
+class PortFollower(Protocol):
+    """Part of services that opens and closes what the ports of a station need."""
+
+    async def open(self, spec: StationSpec) -> None:
+        """Open what *spec* needs beside what is open; raises EnvironmentalError."""
+
+    async def follow(self, spec: StationSpec) -> None:
+        """Use what *spec*, which the station runs, needs, and close the rest."""
+
+    async def discard(self) -> None:
+        """Close what was opened for a specification that the station does not run."""
+
+
 class StationKeeper:
     """Configuration and state that one station runs, and their stored copy.
 
@@ -115,6 +128,7 @@ class StationKeeper:
         cause: Which change that was.
         undone: Whether it was taken back.
         on_change: Called with a new specification once it runs.
+        followers: Have ports follow the specification, before and behind the engine.
         unsaved: Why what runs is not what a start would bring back; None while both agree.
     """
 
@@ -132,6 +146,7 @@ class StationKeeper:
         self.cause = ""
         self.undone = False
         self.on_change: list[Callable[[StationSpec], None]] = []
+        self.followers: list[PortFollower] = []
         self.unsaved: Unsaved | None = None
         self._store = store
         self._engine = engine
@@ -192,6 +207,8 @@ class StationKeeper:
     async def _run(self, record: Stored) -> None:
         spec = record.spec
         try:
+            for follower in self.followers if spec != self.spec else ():
+                await follower.open(spec)
             # Stored before the engine is asked, see rule 1.
             await self._save(record)
             if spec != self.spec or self._is_engine_unknown:
@@ -199,6 +216,8 @@ class StationKeeper:
         except (EngineRefusedError, EngineGoneError, EnvironmentalError) as exc:
             self._is_engine_unknown = isinstance(exc, EngineGoneError)
             await self._save_back()
+            for follower in self.followers:
+                await follower.discard()
             raise DeviceFault(FaultCode.NOT_RUNNING, str(exc)) from None
         self._is_engine_unknown = False
         self.objects, self.previous, self._applied = record.objects, record.previous, record.applied
@@ -207,6 +226,8 @@ class StationKeeper:
             self.spec = spec
             for follow in self.on_change:
                 follow(spec)
+            for follower in self.followers:
+                await follower.follow(spec)
 
     async def change_state(self, state: DeviceState) -> None:
         """Bring the station to *state*.

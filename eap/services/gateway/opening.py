@@ -1,16 +1,14 @@
-"""Assembly of the gateways of an appliance from the plant file."""
+"""Assembly of mailbox gateways from the specifications of their bus ports."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 
 from eap.ams.access import AccessList
 from eap.gateway.request_tracker import ClientLimits
 from eap.gateway.requests import AddressMap, GroupAddress, RemoteAddress, SlaveAddress
 from eap.ids import NetId
-from eap.pd.spec import GatewayAddress, GatewaySpec, StationSpec
-from eap.runtime.handover import Handover, PortName
+from eap.pd.spec import GatewayAddress, GatewaySpec, PortSpec
 from eap.services.device.master_values import MasterDictionaryProvider
 from eap.services.gateway.gateway import MailboxGateway, Settings
 from eap.services.gateway.sessions import MasterSession
@@ -22,93 +20,55 @@ from eap.services.tasks import TaskSet
 _MS = 1000
 
 
-def open_dictionaries(
-    handover: Handover, clients: Mapping[PortName, BusClient], release: str
-) -> dict[PortName, MasterDictionaryProvider]:
-    """Return the dictionary of the master behind each bus port.
+def open_gateway(
+    client: BusClient,
+    port: PortSpec,
+    provider: MasterDictionaryProvider,
+    router: StationRouter,
+) -> MailboxGateway:
+    """Return the gateway to the bus at *port*.
 
     Args:
-        handover: The buses.
-        clients: Of the buses.
-        release: Of this software.
+        client: Of the bus.
+        port: The bus port.
+        provider: Dictionary of the master.
+        router: Of the station: it knows the access rules, and the way to other buses.
     """
-    providers = {}
-    for bus in handover.buses:
-        spec = _gateway_of(handover, bus.owner)
-        providers[bus.owner] = MasterDictionaryProvider(
-            clients[bus.owner], release, full=spec.full, padded=spec.padded
-        )
-    return providers
+    spec = port.gateway or GatewaySpec()
+    settings = _settings(spec, port.net_id, client.name)
+    gateway = MailboxGateway(
+        client,
+        partial(
+            MasterSession,
+            provider.dictionary,
+            settings.max_size,
+            provider.refresh,
+            provider.is_fresh,
+        ),
+        partial(_access_of, router),
+        settings,
+        _addresses(spec),
+        partial(_open_remote, router),
+    )
+    # A disabled gateway exists all the same, so that it can be started at run time.
+    gateway.is_open = spec.enabled
+    return gateway
 
 
-def open_gateways(
-    handover: Handover,
-    clients: Mapping[PortName, BusClient],
-    providers: Mapping[PortName, MasterDictionaryProvider],
-    routers: Mapping[str, StationRouter],
-) -> dict[PortName, MailboxGateway]:
-    """Return the gateway to each bus, in their order.
-
-    Args:
-        handover: The stations and their buses.
-        clients: Of the buses.
-        providers: Dictionaries of the masters, one for each bus.
-        routers: Of the stations: they know the access rules, and the way to other buses.
-    """
-    gateways = {}
-    for bus in handover.buses:
-        spec, router = _gateway_of(handover, bus.owner), routers[bus.owner.station]
-        provider = providers[bus.owner]
-        settings = _settings(spec, handover.port(bus.owner).net_id, clients[bus.owner].name)
-        gateway = MailboxGateway(
-            clients[bus.owner],
-            partial(
-                MasterSession,
-                provider.dictionary,
-                settings.max_size,
-                provider.refresh,
-                provider.is_fresh,
-            ),
-            partial(_access_of, router),
-            settings,
-            _addresses(spec),
-            partial(_open_remote, router),
-        )
-        # A disabled gateway exists all the same, so that it can be started at run time.
-        gateway.is_open = spec.enabled
-        gateways[bus.owner] = gateway
-    return gateways
-
-
-class GatewayFollower:
-    """Keeps the gateways of a station as its specification has them, while it runs.
-
-    Args:
-        spec: That the gateways were opened with.
-        gateways: By bus port.
-    """
-
-    def __init__(self, spec: StationSpec, gateways: Mapping[str, MailboxGateway]) -> None:
-        self._gateways = gateways
-        self._specs = {port.name: port.gateway or GatewaySpec() for port in spec.ports}
-        self._tasks = TaskSet(f"gateways of station {spec.name}")
-
-    def change(self, spec: StationSpec) -> None:
-        """Apply another specification of the station."""
-        for port in spec.ports:
-            gateway = self._gateways.get(port.name)
-            before, becomes = self._specs[port.name], port.gateway or GatewaySpec()
-            if gateway is None or before == becomes:
-                continue
-            self._specs[port.name] = becomes
-            settings = _settings(becomes, port.net_id, gateway.settings.name)
-            gateway.change(settings, _addresses(becomes))
-            # A gateway that a command started or stopped stays so, unless this is what changes.
-            if becomes.enabled and not before.enabled:
-                gateway.start()
-            elif before.enabled and not becomes.enabled:
-                gateway.is_open = False
-                self._tasks.start(gateway.stop())
+def follow_settings(
+    gateway: MailboxGateway, old: GatewaySpec, port: PortSpec, tasks: TaskSet
+) -> None:
+    """Apply the settings of *port* to a *gateway* with the *old* ones; *tasks* may stop it."""
+    new = port.gateway or GatewaySpec()
+    if new == old:
+        return
+    gateway.change(_settings(new, port.net_id, gateway.settings.name), _addresses(new))
+    # A gateway that a command started or stopped stays so, unless this is what changes.
+    if new.enabled and not old.enabled:
+        gateway.start()
+    elif old.enabled and not new.enabled:
+        gateway.is_open = False
+        tasks.start(gateway.stop())
 
 
 def _settings(spec: GatewaySpec, net_id: NetId, name: str) -> Settings:
@@ -124,10 +84,6 @@ def _settings(spec: GatewaySpec, net_id: NetId, name: str) -> Settings:
 
 def _addresses(spec: GatewaySpec) -> AddressMap:
     return AddressMap({each.address: _destination(each) for each in spec.addresses})
-
-
-def _gateway_of(handover: Handover, owner: PortName) -> GatewaySpec:
-    return handover.port(owner).gateway or GatewaySpec()
 
 
 def _access_of(router: StationRouter) -> AccessList:

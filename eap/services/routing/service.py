@@ -105,6 +105,14 @@ class ServiceTable:
         """All NetIDs of the station."""
         return self._services.keys()
 
+    def add_net_id(self, net_id: NetId) -> None:
+        """Add a NetID, without services yet."""
+        self._services.setdefault(net_id, [])
+
+    def remove_net_id(self, net_id: NetId) -> None:
+        """Remove a NetID with its services."""
+        del self._services[net_id]
+
     def add(self, net_id: NetId, service: Service) -> None:
         """Add *service* behind *net_id*; raise KeyError if the station has no such NetID."""
         self._services[net_id].append(service)
@@ -115,7 +123,8 @@ class ServiceTable:
 
     def find(self, header: AmsHeader) -> Service | None:
         """Return the first service with the target port of a request."""
-        for service in self._services[header.target]:
+        # A request may wait for its turn while its device is removed.
+        for service in self._services.get(header.target, ()):
             if header.target_port in service.ports:
                 return service
         return None

@@ -297,6 +297,17 @@ class StationRouter:
         self._act(self._router.remove_transport(name, monotonic_ns()))
         del self._senders[name]
 
+    def add_net_id(self, net_id: NetId) -> None:
+        """Add a NetID of a port, for which services are added next."""
+        self._services.add_net_id(net_id)
+        self._router.add_device(net_id, self._services.ports(net_id))
+
+    def remove_net_id(self, net_id: NetId) -> None:
+        """Remove a NetID of a port with its services; it is routed from now on."""
+        self._router.remove_device(net_id)
+        self._services.remove_net_id(net_id)
+        self._fault_finders.pop(net_id, None)
+
     def add_service(self, net_id: NetId, service: Service) -> None:
         """Add *service* behind *net_id* of the station; the first with a port answers.
 

@@ -52,7 +52,7 @@ from eap.runtime.engine_messages import (
     SlaveDescription,
     UnsolicitedMessage,
 )
-from eap.runtime.handover import BusSocket, PortName
+from eap.runtime.handover import PortName
 from eap.services.engine_link import EngineLink
 
 ENGINE_PING_S = 1.0
@@ -129,6 +129,13 @@ class BusView:
         if not self._is_complete:
             raise EngineGoneError("no report from the engine about the bus")
         return self.latest
+
+    def close(self) -> None:
+        """Receive nothing any more: the bus is gone."""
+        self._link.on_change.remove(self._take)
+        self._link.on_restart.remove(self._forget)
+        self._is_complete = False
+        self.latest = BusDescription(fault="the bus was removed from the plant")
 
     def _take(self, change: BusChange) -> None:
         if change.bus != self._number:
@@ -276,15 +283,22 @@ class BusClient:
         self._link = link
         self._number = number
         self._queues = MailboxQueues()
+        self._listeners: list[Callable[[Unsolicited], None]] = []
+        link.on_unsolicited.append(self._forward)
+
+    def close(self) -> None:
+        """Receive nothing any more: the bus is gone, and the engine refuses requests to it."""
+        self._link.on_unsolicited.remove(self._forward)
+        self.view.close()
 
     def listen(self, notify: Callable[[Unsolicited], None]) -> None:
         """Call *notify* with each message that a slave sends unasked."""
+        self._listeners.append(notify)
 
-        def take(message: UnsolicitedMessage) -> None:
-            if message.bus == self._number:
+    def _forward(self, message: UnsolicitedMessage) -> None:
+        if message.bus == self._number:
+            for notify in self._listeners:
                 notify(message.message)
-
-        self._link.on_unsolicited.append(take)
 
     async def describe(self, timeout_s: float = DESCRIBE_S) -> BusReport:
         """Return the report of the bus; raises EngineGoneError."""
@@ -447,8 +461,3 @@ class BusClient:
         await self._link.request(
             lambda number: ForgetFaults(id=number, bus=self._number), DESCRIBE_S
         )
-
-
-def open_buses(link: EngineLink, buses: Sequence[BusSocket]) -> dict[PortName, BusClient]:
-    """Return the clients of *buses*."""
-    return {bus.owner: BusClient(link, bus.number, bus.owner) for bus in buses}

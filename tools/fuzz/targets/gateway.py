@@ -35,8 +35,9 @@ from eap.ids import NetId
 from eap.od.dictionary import ObjectDictionary
 from eap.od.model import RW, OdState, variable
 from eap.runtime.engine_messages import SlaveDescription
+from eap.runtime.handover import PortName
 from eap.services.gateway.gateway import MailboxGateway, Settings
-from eap.services.gateway.gateway_transport import GatewayTransport
+from eap.services.gateway.gateway_transport import GatewayTable, GatewayTransport
 from eap.services.gateway.sessions import MasterSession
 from eap.services.slaves.bus_client import BusClient, BusDescription, MailboxLock
 from eap.services.slaves.remote_slave import RemoteSlave
@@ -193,7 +194,9 @@ async def _serve(data: bytes) -> None:
         AddressMap({_VIRTUAL: RemoteAddress(_SETTINGS.net_id, 1001)}),
         lambda slave, answer_s: link,
     )
-    transport = GatewayTransport([(gateway, "udp:eap0")])
+    table = GatewayTable()
+    table.replace({PortName("fuzz", "bus0"): gateway})
+    transport = GatewayTransport(table, {"fuzz": "udp:eap0"})
     answered: list[bytes] = []
     for frame, client in zip(_frames(data), cycle("ab"), strict=False):
         transport.receive(frame, client, lambda to, octets: answered.append(octets))

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from eap.codec.pd import decode_frame_header
 from eap.engine.build import EnginePlant
 from eap.engine.channels import PortChannels, has_tcp, sends_to
+from eap.engine.engine_buses import EngineBuses
 from eap.engine.rebuild import MAX_WAITING, EngineStation, StationReplacement
 from eap.errors import EngineRefusedError, EnvironmentalError
 from eap.ids import InterfaceUri, NetId
@@ -43,6 +44,14 @@ from tests.support.cyclic import MS
 from tests.unit.eap.conftest import eap_port, left, right
 
 pytestmark = pytest.mark.net
+
+NO_BUSES = EngineBuses({}, Engine([]))
+
+
+def replacement(place, **changes):
+    """Return the replacement of a station by one with *changes*."""
+    return StationReplacement(place, replace(place.station.spec, **changes), NO_BUSES)
+
 
 PATIENCE_MS = 10_000
 
@@ -184,11 +193,11 @@ def test_one_side_is_swapped_a_hundred_times_while_frames_flow(running, side):
     assert list(running.folder.path.glob(".*")) == []
 
 
-def test_rebuild_that_needs_new_start_is_rejected(running):
+def test_rebuild_without_the_socket_of_its_bus_is_rejected(running):
     running.cycles(3)
     error = running.configure(replace(running.left, ports=(*running.left.ports, BUS)))
     assert isinstance(error, EngineRefusedError)
-    assert str(error) == "port bus0 is new: restart the appliance"
+    assert str(error) == "port bus0: the socket of its bus is missing"
     cycle = running.word("left", StationWord.CYCLE)
     running.cycles(3)
     assert running.word("left", StationWord.CYCLE) == cycle + 3
@@ -319,7 +328,7 @@ def test_rebuild_loses_no_concurrent_writes(place, tmp_path):
     engine.start(0)
     engine.handle_timeout(10 * MS)
     program = open_image(tmp_path / "left.image")
-    successor = StationReplacement(place, replace(place.station.spec, frames=()))
+    successor = replacement(place, frames=())
     with program.image.writing(Writer.APPLICATION):
         program.image.write("running", True)
     assert not program.retired
@@ -340,9 +349,7 @@ def test_rebuild_keeps_partial_write_of_stopped_program(place, tmp_path):
         engine.handle_timeout(20 * MS)
         with program.image.writing(Writer.APPLICATION):
             program.image.write("running", False)
-            before = StationReplacement(place, replace(place.station.spec, frames=())).take_over(
-                engine, 20 * MS
-            )
+            before = replacement(place, frames=()).take_over(engine, 20 * MS)
         assert before.inputs is not place.station.inputs
     assert (
         place.file.image.read("running") is True
@@ -350,15 +357,16 @@ def test_rebuild_keeps_partial_write_of_stopped_program(place, tmp_path):
 
 
 def test_an_image_that_is_not_used_is_removed(place, tmp_path):
-    StationReplacement(place, replace(place.station.spec, frames=())).discard()
+    replacement(place, frames=()).discard()
     with pytest.raises(EngineRefusedError):
-        StationReplacement(place, replace(place.station.spec, name="other"))
+        replacement(place, name="other")
     with pytest.raises(KeyError):
-        StationReplacement(place, replace(place.station.spec, variables=()))
+        replacement(place, variables=())
     assert {path.name for path in tmp_path.iterdir()} == {"left.image", "counts"}
 
 
 pytestmark = pytest.mark.net
+
 
 HERE = "127.9.2.31"
 
@@ -407,7 +415,8 @@ def test_destinations_by_tcp_come_and_go_while_the_station_runs(tmp_path, listen
     engine.start(0)
 
     def configure(*destinations):
-        StationReplacement(place, sending(*destinations)).take_over(engine, engine.next_timeout())
+        successor = StationReplacement(place, sending(*destinations), NO_BUSES)
+        successor.take_over(engine, engine.next_timeout())
         place.channels.update_tcp(place.station)
 
     def accept(listener):

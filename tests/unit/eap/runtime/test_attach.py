@@ -18,6 +18,7 @@ import pytest
 import eap
 from eap.codec.times import LongDuration
 from eap.engine.channels import PortChannels
+from eap.engine.engine_buses import EngineBuses
 from eap.engine.rebuild import EngineStation, StationReplacement
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
 from eap.ids import InterfaceUri, NetId
@@ -96,7 +97,7 @@ class Runner:
 
     def configure(self, station: StationSpec) -> None:
         """Run another specification soon."""
-        self.successors.put(StationReplacement(self._place, station))
+        self.successors.put(StationReplacement(self._place, station, EngineBuses({}, Engine([]))))
 
     @property
     def station(self) -> Station:

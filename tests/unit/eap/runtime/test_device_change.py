@@ -168,7 +168,6 @@ def test_plan_reports_changed_layout_with_same_version(plain):
             "port eap0: net_id 1.2.3.4.5.1 -> 9.9.9.9.9.9",
         ),
         (lambda s: replace(s, ports=()), "port eap0: removed"),
-        (lambda s: replace(s, ports=(*s.ports, BUS)), "port bus0 is new"),
         (lambda s: with_port(s, tcp=True), "port eap0: tcp False -> True"),
     ],
 )

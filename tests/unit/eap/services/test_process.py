@@ -23,7 +23,7 @@ from eap.runtime.engine_messages import BusReport, EngineReply, EngineRequest
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo
 from eap.runtime.handover import Handover
 from eap.runtime.startup import Report
-from eap.services import process
+from eap.services import tasks
 from eap.supervisor.sockets import SharedSockets, inherited_by_services
 from tests.support.startup import read_reports
 
@@ -169,7 +169,7 @@ def test_services_waits_for_images_as_long_as_the_supervisor_lets_it(tmp_path, s
 
 
 def test_keep_serving_begins_again_after_an_error_of_a_socket(monkeypatch, caplog):
-    monkeypatch.setattr(process, "_RETRY_S", 0.0)
+    monkeypatch.setattr(tasks, "_RETRY_S", 0.0)
     outcomes = [OSError(24, "Too many open files"), None]
 
     async def serve():
@@ -177,6 +177,6 @@ def test_keep_serving_begins_again_after_an_error_of_a_socket(monkeypatch, caplo
         if outcome is not None:
             raise outcome
 
-    asyncio.run(process._keep_serving(serve))
+    asyncio.run(tasks.keep_serving(serve))
     assert outcomes == []
     assert "Too many open files" in caplog.messages[0]

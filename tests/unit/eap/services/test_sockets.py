@@ -15,6 +15,7 @@ from eap.codec.ethercat import EAP_PORT
 from eap.runtime.drop_counters import DropCounters
 from eap.runtime.handover import Handover
 from eap.runtime.store import StationStore
+from eap.services.gateway.gateway_transport import GatewayTable
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.sockets import Network, open_transports
 from eap.services.transports.accepting import Listeners
@@ -53,7 +54,9 @@ def script_on(tmp_path):
                     name: StationRoutes(router, RoutingSpec(), StationStore("plant", name).routes)
                     for name, router in routers.items()
                 }
-                network = Network(handover, routers, routes, {}, counters, Listeners(), resources)
+                network = Network(
+                    handover, routers, routes, GatewayTable(), counters, Listeners(), resources
+                )
                 transports = open_transports(network, ours)
                 serving = [
                     asyncio.ensure_future(each.serve()) for each in (*routers.values(), *transports)

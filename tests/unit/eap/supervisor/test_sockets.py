@@ -23,8 +23,8 @@ from eap.runtime.handover import (
     SocketKind,
 )
 from eap.runtime.passing import (
-    CloseBus,
     CloseSocket,
+    KeepBuses,
     OpenBus,
     OpenSocket,
     pass_descriptors,
@@ -383,7 +383,9 @@ def test_services_requests_buses(tmp_path):
         assert services.reply() == ("", {"engine_fd", "command_fd"}, 2)
         shared.confirm(shared.buses[1])
         assert services.reply() is None
-        services.send(CloseBus(simulated))
+        services.send(KeepBuses("a", (remote,)))
+        assert [bus.number for bus in shared.buses] == [1, 2]
+        services.send(KeepBuses("b", ()))
         assert [bus.number for bus in shared.buses] == [1]
         services.send(OpenBus(3, simulated))
         (failing,) = shared.buses[1:]

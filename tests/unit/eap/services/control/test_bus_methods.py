@@ -15,12 +15,11 @@ from eap.errors import ControlError, EngineGoneError
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from eap.runtime.engine_messages import Cancel, ExchangeMailbox
-from eap.runtime.handover import BusSocket, PortName
-from eap.services.control.bus_methods import BusConnection, Buses
+from eap.runtime.handover import PortName
+from eap.services.control.bus_methods import BusConnection, Buses, bus_reports
 from eap.services.engine_link import EngineLink
-from eap.services.slaves.bus_client import open_buses
 from eap.services.slaves.segment_link import SegmentLink
-from tests.support.fakeengine import PORT, FakeBus, FakeEngine, FakeSegment
+from tests.support.fakeengine import PORT, FakeBus, FakeEngine, FakeSegment, bus_clients
 from tests.support.loopbus import LoopBus
 from tests.support.virtualtime import run_virtual
 
@@ -69,10 +68,9 @@ class Scene:
         self.segment = FakeSegment(line)
         self._link = EngineLink(self.engine.services, silence_limit_s=0.1)
         self._segment_link = SegmentLink(self.segment.services)
-        client = open_buses(
-            self._link, [BusSocket(PORT, 0), BusSocket(PortName("left", "bus1"), 1)]
-        )
-        self.buses = Buses(STATIONS, client, {PORT: self._segment_link})
+        self.clients = bus_clients(self._link, PORT, PortName("left", "bus1"))
+        stations = {each.name: each for each in STATIONS}
+        self.buses = Buses(stations, self.clients, {PORT: self._segment_link})
 
     def connect(self):
         return Connection(self.buses)
@@ -266,9 +264,9 @@ def test_parameters_are_checked():
 
 def test_reports_of_those_that_answer():
     async def scene(stage, connection):
-        assert set(await stage.buses.reports(1)) == {PORT}  # the engine knows one bus only
+        assert set(await bus_reports(stage.clients, 1)) == {PORT}  # the engine knows one bus only
         stage.engine.holds = True
-        assert await stage.buses.reports(0.01) == {}
+        assert await bus_reports(stage.clients, 0.01) == {}
         with pytest.raises(EngineGoneError):
             await connection.call("bus_describe", WHERE)
 
@@ -277,8 +275,8 @@ def test_reports_of_those_that_answer():
 
 def test_appliance_without_buses():
     async def scene():
-        buses = Buses(STATIONS[1:], {}, {})
-        assert await buses.reports(1) == {}
+        buses = Buses({"right": STATIONS[1]}, {}, {})
+        assert await bus_reports({}, 1) == {}
         error = await refusal(Connection(buses), "bus_describe", station="right", port="bus0")
         assert "has no bus ports" in str(error)
 

@@ -15,16 +15,14 @@ from eap.ids import InterfaceUri, NetId
 from eap.net.limits import Activity, CloseReason, ListenerLimits
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
-from eap.runtime.handover import BusSocket
 from eap.services.control import control_server
 from eap.services.control.bus_methods import Buses
 from eap.services.control.control_server import ControlConnection, ControlServer
 from eap.services.control.methods import Methods, Watch
 from eap.services.engine_link import EngineLink
-from eap.services.slaves.bus_client import open_buses
 from eap.services.transports.accepting import Listeners
 from tests.support.eventually import eventually, settle
-from tests.support.fakeengine import PORT, FakeBus, FakeEngine
+from tests.support.fakeengine import PORT, FakeBus, FakeEngine, bus_clients
 from tests.support.loopbus import LoopBus
 
 pytestmark = pytest.mark.net
@@ -39,7 +37,7 @@ def methods(images):
     return Methods({"plant": "demo"}, images, status=torn, stop=lambda: 1 / 0)
 
 
-NO_BUSES = Buses((), None, {})
+NO_BUSES = Buses({}, {}, {})
 
 
 def serve_client(server: ControlServer, sock: socket.socket):
@@ -401,7 +399,7 @@ def test_errors_of_a_bus_keep_kind_and_detail(methods):
             "bus0", PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("1.1.1.1.3.1")
         )
         station = StationSpec("left", NetId.parse("1.1.1.1.1.1"), 10_000, (port,))
-        buses = Buses((station,), open_buses(link, [BusSocket(PORT)]), {})
+        buses = Buses({"left": station}, bus_clients(link, PORT), {})
         where = {"station": "left", "port": "bus0"}
         async with Talk(ControlServer(methods, buses)) as client:
             answer = await client.ask("bus_open", **where, slave=1009, protocol="coe")

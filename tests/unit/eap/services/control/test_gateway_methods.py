@@ -15,6 +15,7 @@ from eap.ids import Endpoint, NetId
 from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
 from eap.services.control.bus_methods import GatewayMethods
 from eap.services.gateway.gateway import Settings
+from eap.services.gateway.gateway_transport import GatewayTable
 from eap.services.gateway.reply_encoder import GatewayStatistics
 from eap.services.gateway.sessions import SessionKey
 from tests.support.cyclic import station
@@ -60,7 +61,9 @@ def ask(gateways):
             SharedSocket(SocketKind.GATEWAY_TCP, "127.0.9.1", 34981, owners=(SECOND,)),
         ),
     )  # fmt: skip
-    methods = GatewayMethods(handover, gateways).table()
+    table = GatewayTable()
+    table.replace(gateways)
+    methods = GatewayMethods(handover, table).table()
 
     def call(what: str, **params: Any) -> Any:
         answer = methods[f"gateway_{what}"](params)

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from eap.od.model import OdState
 from eap.pd.spec import GatewayAddress, GatewaySpec
-from eap.runtime.handover import BusSocket, Handover, PortName
+from eap.services.device.master_values import MasterDictionaryProvider
 from eap.services.engine_link import EngineLink
-from eap.services.gateway.opening import open_dictionaries, open_gateways
-from eap.services.slaves.bus_client import open_buses
-from tests.support.cyclic import bus_port, eap_port, station
-from tests.support.fakeengine import FakeBus, FakeEngine
+from eap.services.gateway.opening import follow_settings, open_gateway
+from eap.services.slaves.bus_client import BusClient
+from eap.services.tasks import TaskSet
+from tests.support.cyclic import bus_port
+from tests.support.fakeengine import PORT, FakeBus, FakeEngine
 from tests.support.loopbus import LoopBus
 from tests.support.routing import station as router
 from tests.support.virtualtime import run_virtual
 
-NAMES = [PortName("left", "bus0"), PortName("left", "bus1")]
-BUSES = tuple(BusSocket(name, number) for number, name in enumerate(NAMES))
 TOLD = GatewaySpec(
     enabled=False,
     answer_ms=250,
@@ -28,31 +26,49 @@ TOLD = GatewaySpec(
 )
 
 
-def test_each_bus_has_one_as_the_plant_file_says() -> None:
+def test_gateway_is_as_the_plant_file_says() -> None:
     async def run() -> None:
-        engine = FakeEngine(FakeBus(LoopBus("drive")), FakeBus(LoopBus("drive")))
+        engine = FakeEngine(FakeBus(LoopBus("drive")))
         link = EngineLink(engine.services)
-        ports = (eap_port(), replace(bus_port("bus0"), gateway=TOLD), bus_port(name="bus1"))
-        handover = Handover(
-            supervisor=1, folder="", plant="p", plant_file="",
-            stations=(station(name="left", ports=ports), station(name="right")),
-            sockets=(), buses=BUSES,
-        )  # fmt: skip
+        client = BusClient(link, 0, PORT)
+        provider = MasterDictionaryProvider(client, "1.0")
+        there = router("5.1.1.1.1.1")
         try:
-            clients = open_buses(link, BUSES)
-            providers = open_dictionaries(handover, clients, "1.0")
-            gateways = open_gateways(handover, clients, providers, {"left": router("5.1.1.1.1.1")})
-            assert list(gateways) == NAMES
-            first, second = gateways.values()
+            first = open_gateway(client, replace(bus_port(), gateway=TOLD), provider, there)
+            second = open_gateway(client, bus_port(), provider, there)
             assert (first.is_open, second.is_open) == (False, True)
             assert (first.settings.answer_s, first.settings.is_silent) == (0.25, True)
             assert first.settings.limits.in_flight == 3
-            extents = []
-            for provider in providers.values():
-                await provider.refresh(0xA000)
-                extents.append(provider.dictionary.upload(0xA000, 0, OdState.OP)[0])
-            assert extents == [19, 17]
+            assert first.settings.name == "left/bus0"
         finally:
+            link.close()
+            engine.close()
+
+    run_virtual(run())
+
+
+def test_gateway_follows_other_settings() -> None:
+    async def run() -> None:
+        engine = FakeEngine(FakeBus(LoopBus("drive")))
+        link = EngineLink(engine.services)
+        client, tasks = BusClient(link, 0, PORT), TaskSet("test")
+        provider = MasterDictionaryProvider(client, "1.0")
+        gateway = open_gateway(client, bus_port(), provider, router("5.1.1.1.1.1"))
+
+        def follow(old: GatewaySpec, new: GatewaySpec) -> bool:
+            follow_settings(gateway, old, replace(bus_port(), gateway=new), tasks)
+            return gateway.is_open
+
+        try:
+            assert follow(GatewaySpec(), GatewaySpec(answer_ms=250))
+            assert gateway.settings.answer_s == 0.25
+            assert not follow(GatewaySpec(answer_ms=250), GatewaySpec(enabled=False))
+            assert not follow(GatewaySpec(enabled=False), GatewaySpec(enabled=False, rate=5))
+            assert follow(GatewaySpec(enabled=False), GatewaySpec())
+            gateway.is_open = False  # by a command
+            assert not follow(GatewaySpec(), GatewaySpec(rate=5))
+        finally:
+            await tasks.close()
             link.close()
             engine.close()
 

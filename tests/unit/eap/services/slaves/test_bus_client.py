@@ -19,12 +19,12 @@ from eap.codec.mailbox import MailboxType
 from eap.errors import EngineGoneError
 from eap.od.abort import SdoAbortError
 from eap.runtime.engine_messages import Cancel, ExchangeMailbox
-from eap.runtime.handover import BusSocket, PortName
+from eap.runtime.handover import PortName
 from eap.services.engine_link import EngineLink
 from eap.services.slaves import bus_client
-from eap.services.slaves.bus_client import BusClient, open_buses
+from eap.services.slaves.bus_client import BusClient
 from tests.support.eventually import settle
-from tests.support.fakeengine import PORT, FakeBus, FakeEngine
+from tests.support.fakeengine import PORT, FakeBus, FakeEngine, bus_clients
 from tests.support.loopbus import LoopBus
 from tests.support.virtualtime import run_virtual
 
@@ -271,7 +271,7 @@ def test_bus_clients_request_their_buses_by_number():
         link = EngineLink(engine.services)
         second = PortName("left", "bus1")
         try:
-            clients = open_buses(link, [BusSocket(PORT, 0), BusSocket(second, 1)])
+            clients = bus_clients(link, PORT, second)
             found = {port: len((await each.describe()).slaves) for port, each in clients.items()}
             assert found == {PORT: 1, second: 3}
             assert [each.bus for each in engine.requests] == [0, 1]

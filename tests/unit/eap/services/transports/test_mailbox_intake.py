@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, cast
+
 import pytest
 
 from eap.ams.transport_table import Transport
 from eap.runtime.drop_counters import DropReason
-from eap.services.gateway.gateway_transport import GatewayTransport
+from eap.runtime.handover import PortName
+from eap.services.gateway.gateway_transport import GatewayTable, GatewayTransport
 from eap.services.transports.mailbox_frames import ChannelSender, MailboxIntake
 from tests.support import aoe
 from tests.support.routing import demultiplexer, station
+
+if TYPE_CHECKING:
+    from eap.services.gateway.gateway import MailboxGateway
 
 TARGET = "1.1.1.1.2.1"
 
@@ -40,7 +46,7 @@ def tell(wire: Wire, frame: bytes, *, for_many: bool = False, room: int = 0) -> 
     sender = ChannelSender(wire)
     there.add_transport(Transport("link", room), sender)
     intake = MailboxIntake(
-        demultiplexer(there), GatewayTransport([]), sender, lambda data: for_many
+        demultiplexer(there), GatewayTransport(GatewayTable(), {}), sender, lambda data: for_many
     )
     return intake.receive(memoryview(frame + bytes(20)), len(frame), 0, wire)
 
@@ -107,7 +113,9 @@ def test_dropped_frame_has_a_reason():
     ],
 )
 def test_drop_reason_does_not_handle_the_frame(frame, behind, for_many, reason):
-    gateway = GatewayTransport([(object(), name) for name in behind])
+    table = GatewayTable()
+    table.replace({PortName(name, "bus0"): cast("MailboxGateway", object()) for name in behind})
+    gateway = GatewayTransport(table, dict.fromkeys(behind, "udp:eap0"))
     sender = ChannelSender(Wire())
     intake = MailboxIntake(demultiplexer(station(TARGET)), gateway, sender, lambda data: for_many)
     assert intake.drop_reason(memoryview(frame + bytes(9)), len(frame), 0, Wire()) is reason

@@ -13,7 +13,7 @@ from eap.codec.ams import AmsAnswer
 from eap.ids import Endpoint, NetId
 from eap.net.limits import OWN_HOST
 from eap.runtime.drop_counters import DropReason
-from eap.services.gateway.gateway_transport import GatewayTransport
+from eap.services.gateway.gateway_transport import GatewayTable, GatewayTransport
 from eap.services.transports import mailbox_stream
 from eap.services.transports.mailbox_stream import MailboxStreams, StreamConnection
 from tests.support import aoe
@@ -33,7 +33,9 @@ def talk(script, there=None) -> list[DropReason]:
     """Run ``script(reader, writer)`` on a connection that is being served."""
     there = there or station(TARGET)
     refused: list[DropReason] = []
-    streams = MailboxStreams(demultiplexer(there), GatewayTransport([]), refused.append)
+    streams = MailboxStreams(
+        demultiplexer(there), GatewayTransport(GatewayTable(), {}), refused.append
+    )
     there.add_transport(Transport("link", 2000, is_stream=True), streams)
 
     async def run():
@@ -129,7 +131,7 @@ def test_hop_sends_requests_on_the_same_connection():
     here, there = station("2.2.2.2.2.1"), station(TARGET)
     refused: list[DropReason] = []
     near, far = (
-        MailboxStreams(demultiplexer(each), GatewayTransport([]), refused.append)
+        MailboxStreams(demultiplexer(each), GatewayTransport(GatewayTable(), {}), refused.append)
         for each in (here, there)
     )
     here.add_transport(Transport("link", 2000, is_stream=True), near)

@@ -16,7 +16,7 @@ from eap.net.limits import OWN_HOST, Activity, ListenerLimits
 from eap.runtime.drop_counters import DropReason
 from eap.runtime.handover import PortName
 from eap.runtime.passing import receive_passed
-from eap.services.gateway.gateway_transport import GatewayTransport
+from eap.services.gateway.gateway_transport import GatewayTable, GatewayTransport
 from eap.services.transports import accepting
 from eap.services.transports import mailbox_stream as tcp_door
 from eap.services.transports.accepting import Listeners
@@ -68,7 +68,9 @@ def play(
         services, engine = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with services, engine, socket.create_server(("127.0.0.1", 0)) as listener:
             there = station(TARGET)
-            streams = MailboxStreams(demultiplexer(there), GatewayTransport([]), refused.append)
+            streams = MailboxStreams(
+                demultiplexer(there), GatewayTransport(GatewayTable(), {}), refused.append
+            )
             there.add_transport(Transport("link", is_stream=True), streams)
             listeners = Listeners(int(patience_s * 1e9))
             transport = TcpTransport(listener, takers, services, refused.append, streams, listeners)
