@@ -196,6 +196,7 @@ _COMMANDS = {
     "sim": ("sim:sim", "Run simulated slaves, and inject faults."),
     "state": ("od:state", "Show or request the state of a station or slave."),
     "status": ("status:status", "Show errors, stations, ports, process data and processes."),
+    "top": ("top:top", "Watch stations, process data, buses, routes and events live."),
     "types": ("types:types", "Show the data types of a plant file with their layout."),
     "trace": ("network:trace", "Show the path to a device, and the hop that failed."),
 }

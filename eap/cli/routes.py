@@ -11,7 +11,7 @@ import click
 from eap.cli.group import ExitCode, LazyGroup
 from eap.cli.output import Renderer, write_text
 from eap.cli.params import ANSWER_MARGIN_S, examples, json_option, plant_option
-from eap.errors import ControlError, EnvironmentalError
+from eap.errors import ControlError
 
 if TYPE_CHECKING:
     from eap.control.routes import ImportRow, NeighbourRow, TestResult
@@ -47,7 +47,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False, allow_dash=True)
 def routes(ctx: click.Context, plant: str | None) -> None:
     """Show the AMS routes and connections of running stations.
 
-    Without a command, a terminal shows a live table with keyboard and mouse; otherwise the table is
+    Without a command, a terminal shows 'eapctl top' with its view of routes; otherwise the table is
     printed once, like 'eapctl routes list'.
     """
     if ctx.invoked_subcommand is not None:
@@ -58,25 +58,14 @@ def routes(ctx: click.Context, plant: str | None) -> None:
     if not is_terminal():
         ctx.invoke(list_all, plant=plant, station=None, match="", output=Renderer(is_json=False))
         return
-    _run_view(plant)
+    from eap.cli.top import run_app
+
+    run_app(plant or "", tab="routes", may_write=True, instead="'eapctl routes list'")
 
 
 def is_terminal() -> bool:
     """Return whether stdin and stdout are a terminal."""
     return sys.stdin.isatty() and sys.stdout.isatty()
-
-
-def _run_view(plant: str | None) -> None:
-    try:
-        from eap.cli.routes_tui.app import run_view
-    except ModuleNotFoundError as exc:
-        if exc.name != "textual":
-            raise
-        raise EnvironmentalError(
-            "the live view needs Textual: install it with pip install 'eap-appliance[tui]', or use"
-            " 'eapctl routes list'"
-        ) from None
-    run_view(plant)
 
 
 @click.command("list", short_help="List routes and connections.")

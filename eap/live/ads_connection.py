@@ -73,7 +73,7 @@ _NET_ID_NUMBERS = 6
 _MAX_PACKET = 1 << 20
 
 
-class RemoteAddress(NamedTuple):
+class RemoteHost(NamedTuple):
     """Station of another host: the address of a router, and the NetID of the station."""
 
     host: str
@@ -122,7 +122,7 @@ class AdsConnection:
         self._tasks.start(self._receive())
 
     @classmethod
-    async def open(cls, address: RemoteAddress) -> Self:
+    async def open(cls, address: RemoteHost) -> Self:
         """Connect to the router of *address*.
 
         Raises:

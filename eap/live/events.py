@@ -85,12 +85,13 @@ class EventLog:
             now_s: Its Unix time.
             unreachable: Appliances or hosts that do not answer, with the reason.
         """
+        # Causes come last: a view that shows the latest events alone shows them.
         found = [
-            *self._reachability(unreachable, now_ns),
-            *self._restarts(report),
+            *self._counts(report, now_ns),
             *self._states(report),
             *self._fault_changes(report, now_ns),
-            *self._counts(report, now_ns),
+            *self._restarts(report),
+            *self._reachability(unreachable, now_ns),
         ]
         self._before = report
         events = [LiveEvent(round(now_s, 3), *each) for each in found]

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias
 
 import msgspec
 
-from eap.live.findings import StatusReport, is_hung
+from eap.live.findings import REASONS, StatusReport, is_hung
 
 Row: TypeAlias = Mapping[str, Any]
 StationKey: TypeAlias = tuple[str, str]
@@ -33,7 +33,8 @@ class StationRow(msgspec.Struct, frozen=True, kw_only=True):
         rx_per_s: PDs that it receives a second.
         lost: PDs that were lost, where the sender's step is known.
         late: PDs that came late.
-        age_us: Age of its oldest received PD; None before the first.
+        age_us: Age of its oldest received PD, of those that are sent in a fixed step if there are
+            any; None before the first.
         jitter_p99_us: The highest 99th percentile of the jitter of its received PDs.
         bus: Slaves in OP of all slaves, such as ``2/2 OP``; a bus that is down; empty without one.
     """
@@ -85,6 +86,46 @@ class PdFlow(msgspec.Struct, frozen=True, kw_only=True):
     jitter_p99_us: int | None
     quality: int | None
     dropped: int
+
+
+class BusRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One bus, or one of its slaves.
+
+    Attributes:
+        plant: Plant of the station.
+        station: The station.
+        port: Port of the bus.
+        name: Name of the slave; empty for the bus as a whole.
+        address: Station address of the slave; None for the bus.
+        state: State of the slave, ``lost`` without an answer; of the bus ``up`` or ``down``.
+        target: State in which the master keeps the slave.
+        lost: Lost exchanges of process data of the bus; None of a slave.
+        wkc: Exchanges with a wrong working counter; None of a slave.
+        fault: Present fault in words, or empty.
+    """
+
+    plant: str
+    station: str
+    port: str
+    name: str
+    address: int | None
+    state: str
+    target: str
+    lost: int | None
+    wkc: int | None
+    fault: str
+
+
+def bus_rows(now: StatusReport, since: StatusReport | None = None) -> list[BusRow]:
+    """Return a row for each bus, each followed by those of its slaves."""
+    first = stations_of(since)
+    return [
+        row
+        for station in now.stations
+        for port in station["ports"]
+        if port["kind"] == "bus"
+        for row in _bus_rows(station, port, _bus_of(first.get(key_of(station)), port["name"]))
+    ]
 
 
 def station_rows(
@@ -142,7 +183,7 @@ def rate(now: int, before: int, station: Row, earlier: Row) -> float | None:
     seconds = station_s(station) - station_s(earlier)
     if now < before or seconds < 0:
         return None
-    return (now - before) / seconds if seconds else 0.0
+    return round((now - before) / seconds, 1) if seconds else 0.0
 
 
 def count_total(station: Row, direction: str, key: str) -> int:
@@ -177,6 +218,46 @@ def _bus_text(bus: Row) -> str:
     return f"{in_op}/{len(slaves)} OP"
 
 
+def _bus_of(station: Row | None, name: str) -> Row:
+    """Return the bus of a port, empty if there is none."""
+    ports = () if station is None else station["ports"]
+    found: Row = next((each["bus"] for each in ports if each["name"] == name and "bus" in each), {})
+    return found
+
+
+def _bus_rows(station: Row, port: Row, first: Row) -> Iterator[BusRow]:
+    own = {"plant": station["plant"], "station": station["name"], "port": port["name"]}
+    bus = port.get("bus")
+    if bus is None:
+        yield BusRow(
+            **own, name="", address=None, state="unknown", target="", lost=None, wkc=None,
+            fault="the engine does not report it",
+        )  # fmt: skip
+        return
+    yield BusRow(
+        **own,
+        name="",
+        address=None,
+        state="up" if bus["is_up"] else "down",
+        target="",
+        lost=max(bus["lost"] - first.get("lost", 0), 0),
+        wkc=max(bus["wkc_errors"] - first.get("wkc_errors", 0), 0),
+        fault=bus["fault"] or "; ".join(each["what"] for each in bus["findings"]),
+    )
+    for slave in bus["slaves"]:
+        is_absent = slave.get("is_absent")
+        yield BusRow(
+            **own,
+            name=slave["name"],
+            address=slave["address"],
+            state="absent" if is_absent else slave["state"] or "lost",
+            target=slave.get("target") or "",
+            lost=None,
+            wkc=None,
+            fault=slave["fault"],
+        )
+
+
 def _station_row(station: Row, earlier: Row | None, first: Row | None) -> StationRow:
     def per_s(direction: str, key: str) -> float | None:
         if earlier is None:
@@ -189,7 +270,9 @@ def _station_row(station: Row, earlier: Row | None, first: Row | None) -> Statio
         return total if first is None else max(total - count_total(first, "rx", key), 0)
 
     received = station["pd"]["rx"]
-    ages = [row["age_us"] for row in received if row["age_us"] is not None]
+    # Of PDs on change and the like only an age says nothing: no news is as configured.
+    timed = [row for row in received if row["lost"] is not None] or received
+    ages = [row["age_us"] for row in timed if row["age_us"] is not None]
     jitters = [row["jitter_us"]["p99"] for row in received if row["jitter_us"]["p99"] is not None]
     return StationRow(
         plant=station["plant"],
@@ -230,9 +313,10 @@ def _flows(station: Row, earlier: Row | None, first: Row | None) -> Iterator[PdF
 
 
 def _sent(row: Row, common: dict[str, Any]) -> PdFlow:
+    reason: str = row.get("last_reason") or ""
     return PdFlow(
         direction="tx",
-        state=row.get("last_reason") or "",
+        state=REASONS.get(reason, reason),
         lost=None,
         late=None,
         age_us=None,

@@ -147,13 +147,18 @@ class LiveView:
                 return source.client
         raise ControlError(f"station {station} of plant {plant} does not run")
 
-    async def take(self) -> LiveReport:
-        """Return the present status; never raises EapError."""
+    async def take(self, *, within_s: float | None = None) -> LiveReport:
+        """Return the present status; never raises EapError.
+
+        Args:
+            within_s: Time after which it does without an appliance that has not answered yet;
+                that of the view unless given.
+        """
         if self._is_local:
             await self._find_local()
         waiting = [source.ask() for source in self._sources.values()]
         if waiting:
-            await asyncio.wait(waiting, timeout=self._answer_s)
+            await asyncio.wait(waiting, timeout=within_s or self._answer_s)
         at_ns, now_s = time.monotonic_ns(), time.time()
         silent = [
             SilentAppliance(info.plant, info.stations, info.services.pid)
@@ -172,7 +177,7 @@ class LiveView:
     def _unreachable(self) -> Iterator[tuple[str, str]]:
         for source in self._sources.values():
             if not source.has_answered():
-                yield source.name, "does not answer"
+                yield source.name, source.why or "does not answer"
             elif source.document is None:
                 yield source.name, source.why
 
@@ -183,6 +188,8 @@ class LiveView:
         for source in self._sources.values():
             document = source.document
             if document is None or not source.has_answered():
+                continue
+            if self._plant not in {"", document["plant"]}:
                 continue
             keys = [(document["plant"], each["name"]) for each in document["stations"]]
             if keys and known.issuperset(keys):

@@ -15,7 +15,7 @@ import pytest
 
 from eap.control.protocol import READ, WRITE, ErrorCode, ValuesEvent
 from eap.errors import ControlError
-from eap.live.ads_connection import AdsConnection, RemoteAddress
+from eap.live.ads_connection import AdsConnection, RemoteHost
 from eap.live.client import LiveClient
 from eap.live.rows import station_rows
 from eap.live.transport import Subscription
@@ -144,7 +144,7 @@ def test_other_operations_are_refused_by_ads_errors(foreign: Any) -> None:
 
 def play(script: Callable[[LiveClient], Awaitable[None]], host: str = HOST) -> None:
     async def run() -> None:
-        client = LiveClient(partial(AdsConnection.open, RemoteAddress.parse(host)))
+        client = LiveClient(partial(AdsConnection.open, RemoteHost.parse(host)))
         try:
             async with asyncio.timeout(60):
                 await script(client)
@@ -156,7 +156,7 @@ def play(script: Callable[[LiveClient], Awaitable[None]], host: str = HOST) -> N
 
 def test_remote_view_shows_the_stations_that_may_be_read(plant: Appliance) -> None:
     async def run() -> None:
-        client = LiveClient(partial(AdsConnection.open, RemoteAddress.parse(HOST)))
+        client = LiveClient(partial(AdsConnection.open, RemoteHost.parse(HOST)))
         async with asyncio.timeout(60), LiveView(remote={HOST: client}) as view:
             report = await view.take()
             assert [row.name for row in station_rows(report.status)] == ["open", "viewed"]
@@ -238,4 +238,4 @@ def test_remote_client_says_why_it_has_no_connection(
 @pytest.mark.parametrize("text", ["", "127.9.44.1.1.1", "host:", "host:5.1.2"])
 def test_remote_address_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
-        RemoteAddress.parse(text)
+        RemoteHost.parse(text)

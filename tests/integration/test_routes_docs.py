@@ -8,10 +8,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from eap.cli.routes_tui.app import RoutesApp
 from eap.cli.routes_tui.table import RouterClient
 from eap.ops.routing import list_routes
 from tests.support.appliance import wait_until
+from tests.support.liveviews import routes_app
 from tests.support.pages import ROOT, Shell, commands, shell
 from tests.support.screens import Screen, play
 
@@ -46,9 +46,11 @@ def screen_after(keys: tuple[str, ...]) -> str:
     shown = []
 
     async def script(screen: Screen) -> None:
-        shown.append(await screen.press(*keys))
+        for key in keys:  # a message comes when its request is answered
+            await screen.press(key)
+        shown.append(screen.text())
 
-    play(RoutesApp(RouterClient(None), period_s=1000.0), script)
+    play(routes_app(RouterClient(None)), script)
     return "\n".join(line.rstrip() for line in shown[0].splitlines()) + "\n"
 
 

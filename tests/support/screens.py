@@ -24,6 +24,17 @@ class Screen:
         await self.pilot.press(*keys)
         return await self.settle()
 
+    async def press_key(self, key: str) -> str:
+        """Press a key of an app with a worker that never ends, and return what is shown then."""
+        await self.pilot.press(key)
+        return await self.settle_screen()
+
+    async def settle_screen(self) -> str:
+        """Return what is on the screen when all messages are handled, whatever workers do."""
+        await self.pilot.pause()
+        await self.pilot.pause()
+        return self.text()
+
     async def write(self, text: str) -> str:
         """Paste *text* into the field that has the focus."""
         field = self.app.focused
@@ -53,7 +64,7 @@ def play(app: App[None], script: Script, size: tuple[int, int] = (80, 24)) -> No
     async def run() -> None:
         async with app.run_test(size=size) as pilot:
             screen = Screen(pilot)
-            await screen.settle()
+            await screen.settle_screen()
             await script(screen)
 
     asyncio.run(run())

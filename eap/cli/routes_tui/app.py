@@ -1,4 +1,4 @@
-"""Screens of the live view: the table with the details of its current row, forms, and requests.
+"""Live view of routes: the table with the details of its current row, forms, and requests.
 
 Each request connects anew, because appliances start and end while the view is open.
 """
@@ -11,23 +11,25 @@ from typing import Any, ClassVar
 
 from rich.text import Text
 from textual import on, work
-from textual.app import App, ComposeResult
+from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
-from textual.screen import ModalScreen
+from textual.screen import ModalScreen, Screen
 from textual.widgets import Button, Checkbox, DataTable, Footer, Input, Label, Static
 
 from eap.cli import routes_view
 from eap.cli.routes_tui.table import (
     STYLES,
-    Grid,
+    Line,
     PlantRouter,
-    RouterClient,
+    RouteRequests,
     Snapshot,
     View,
+    columns_of,
     detail,
     lines,
 )
+from eap.cli.top_tui.grid import Grid
 from eap.control.routes import (
     RouteRow,
 )
@@ -42,17 +44,15 @@ _SCROLLBAR = 1
 """Columns that one takes when there are more rows than lines."""
 
 
-class RoutesApp(App[None]):
+class RoutesScreen(Screen[None]):
     """Routes and connections of running stations.
 
     Args:
         client: Sends the requests.
         period_s: Period of requests.
+        refusal: Why routes are not changed here; empty if they are.
     """
 
-    CSS_PATH = "style.tcss"
-    ENABLE_COMMAND_PALETTE = False
-    TITLE = "eapctl routes"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("a", "add", "Add"),
         Binding("e", "edit", "Edit"),
@@ -64,12 +64,14 @@ class RoutesApp(App[None]):
         Binding("c", "view('connections')", "Connections", show=False),
         Binding("w", "view('warnings')", "Warnings", show=False),
         Binding("question_mark,f1", "help", "Help", key_display="?"),
-        Binding("q,ctrl+c", "quit", "Quit", key_display="q"),
     ]
 
-    def __init__(self, client: RouterClient, *, period_s: float = PERIOD_S) -> None:
+    def __init__(
+        self, client: RouteRequests, *, period_s: float = PERIOD_S, refusal: str = ""
+    ) -> None:
         super().__init__()
         self._client = client
+        self._refusal = refusal
         self._period_s = period_s
         self._snapshot = Snapshot([], "sending…")
         self._view = View.ROUTES
@@ -87,10 +89,14 @@ class RoutesApp(App[None]):
             yield Static(id="message")
         yield Footer(compact=True)
 
+    @property
+    def _grid(self) -> Grid[Line]:
+        return self.query_one("#table", Grid)
+
     def on_mount(self) -> None:
         """Start the periodic requests."""
         self.query_one("#filter").display = False
-        self.query_one(Grid).focus()
+        self._grid.focus()
         self.set_interval(self._period_s, self.fetch)
         self.fetch()
 
@@ -99,7 +105,9 @@ class RoutesApp(App[None]):
         self.call_after_refresh(self._show)
 
     def fetch(self) -> None:
-        """Request the routes, unless a request is under way."""
+        """Request the routes, unless a request is under way or another view is shown."""
+        if self not in self.app.screen_stack:
+            return
         # One request at a time: a station that does not answer must not pile up threads.
         if self._requested_at is None:
             self._requested_at = monotonic()
@@ -113,7 +121,7 @@ class RoutesApp(App[None]):
     @work(thread=True)
     def _look(self, match: str) -> None:
         snapshot = self._client.fetch(match)
-        self.call_from_thread(self._take, snapshot)
+        self.app.call_from_thread(self._take, snapshot)
 
     def _take(self, snapshot: Snapshot) -> None:
         self._requested_at = None
@@ -136,8 +144,8 @@ class RoutesApp(App[None]):
         found = lines(self._view, routers, self._match)
         self._show_head(routers)
         has_station = len(routers) > 1
-        self.query_one(Grid).show_lines(
-            self._view, found, self.size.width - _SCROLLBAR, has_station=has_station
+        self._grid.show_lines(
+            columns_of(self._view, has_station=has_station), found, self.size.width - _SCROLLBAR
         )
         self._show_detail()
 
@@ -157,20 +165,20 @@ class RoutesApp(App[None]):
             View.WARNINGS: sum(len(each.warnings) for each in stations),
         }
         parts = [
-            f"[@click=app.view('{view}')]{'[reverse]' if view is self._view else ''}"
+            f"[@click=screen.view('{view}')]{'[reverse]' if view is self._view else ''}"
             f" {view[0]} {view.capitalize()} {counts[view]} "
             f"{'[/]' if view is self._view else ''}[/]"
             for view in View
         ]
-        parts.append(f"[@click=app.station()] s {self._station} [/]")
+        parts.append(f"[@click=screen.station()] s {self._station} [/]")
         if self._match:
-            parts.append(f"[@click=app.filter()] Filter: {self._match.replace('[', '')} [/]")
+            parts.append(f"[@click=screen.filter()] Filter: {self._match.replace('[', '')} [/]")
         self.query_one("#views", Static).update("".join(parts))
 
     @on(DataTable.RowHighlighted)
     def _show_detail(self) -> None:
         text = Text("\n").join(
-            Text(part, style=STYLES[style]) for part, style in detail(self.query_one(Grid).chosen)
+            Text(part, style=STYLES[style]) for part, style in detail(self._grid.chosen)
         )
         self.query_one("#message", Static).update(text)
 
@@ -205,7 +213,7 @@ class RoutesApp(App[None]):
     @on(Input.Submitted, "#filter")
     def _leave_filter(self) -> None:
         self.query_one("#filter").display = False
-        self.query_one(Grid).focus()
+        self._grid.focus()
 
     def key_escape(self) -> None:
         """End the filter."""
@@ -215,12 +223,16 @@ class RoutesApp(App[None]):
 
     def action_add(self) -> None:
         """Open a form for a new route of the chosen station."""
+        if self._is_refused("Add"):
+            return
         if (router := self._router()) is not None:
             self._ask_for(router, f"New route of {router.routes.station}", {"octets": "4"})
 
     def action_edit(self) -> None:
         """Open a form for a change of the chosen route."""
-        line = self.query_one(Grid).chosen
+        if self._is_refused("Edit"):
+            return
+        line = self._grid.chosen
         if line is None or not isinstance(line.row, RouteRow):
             self._show_problem("Edit", "Choose a route first.")
         elif line.row.origin != "added":
@@ -231,7 +243,9 @@ class RoutesApp(App[None]):
 
     def action_remove(self) -> None:
         """Remove the chosen route after a confirmation."""
-        line = self.query_one(Grid).chosen
+        if self._is_refused("Remove"):
+            return
+        line = self._grid.chosen
         if line is None or not isinstance(line.row, RouteRow):
             self._show_problem("Remove", "Choose a route first.")
             return
@@ -243,11 +257,17 @@ class RoutesApp(App[None]):
 
         station = router.routes.station
         text = f"Remove route {row.name} ({row.pattern}, {routes_view.path_of(row)}) of {station}?"
-        self.push_screen(Question(text), answered)
+        self.app.push_screen(Question(text), answered)
+
+    def _is_refused(self, title: str) -> bool:
+        """Say why routes are not changed here; return whether that is so."""
+        if self._refusal:
+            self._show_problem(title, self._refusal)
+        return bool(self._refusal)
 
     def action_test(self) -> None:
         """Measure the round trip to the chosen route's station."""
-        line = self.query_one(Grid).chosen
+        line = self._grid.chosen
         if line is None or not isinstance(line.row, RouteRow):
             self._show_problem("Test", "Choose a route first.")
         elif not line.row.octets:
@@ -264,8 +284,8 @@ class RoutesApp(App[None]):
         try:
             self._client.remove(router, row.net_id, row.transport, row.address)
         except EapError as exc:
-            self.call_from_thread(self._show_problem, "Remove", str(exc))
-        self.call_from_thread(self.fetch)
+            self.app.call_from_thread(self._show_problem, "Remove", str(exc))
+        self.app.call_from_thread(self.fetch)
 
     @work(thread=True)
     def _test(self, router: PlantRouter, row: RouteRow) -> None:
@@ -278,8 +298,8 @@ class RoutesApp(App[None]):
             line = f"{result.target}{trip}: {result.text}"
             text = "\n".join(filter(None, [line, result.hint]))
         title = f"{router.routes.station} to {row.name}"
-        self.call_from_thread(self._show_problem, title, text)
-        self.call_from_thread(self.fetch)
+        self.app.call_from_thread(self._show_problem, title, text)
+        self.app.call_from_thread(self.fetch)
 
     def _ask_for(self, router: PlantRouter, title: str, values: dict[str, Any]) -> None:
         def ended(warnings: list[str] | None) -> None:
@@ -288,17 +308,17 @@ class RoutesApp(App[None]):
                 self._show_problem("Added, but", "\n".join(warnings))
 
         form = RouteForm(title, values, lambda params: self._client.add(router, params))
-        self.push_screen(form, ended)
+        self.app.push_screen(form, ended)
 
     def _router(self) -> PlantRouter | None:
-        line = self.query_one(Grid).chosen
+        line = self._grid.chosen
         if line is not None:
             return line.router
         routers = self._routers()
         return routers[0] if routers else None
 
     def _show_problem(self, title: str, text: str) -> None:
-        self.push_screen(Message(title, text))
+        self.app.push_screen(Message(title, text))
 
 
 _HELP = """\
@@ -309,6 +329,7 @@ e d      edit or remove a route that was added
 /        show only rows that have a text in them; Esc ends that
 s        show one station after the other, then all
 r c w    show routes, connections, warnings
+1 to 5   other views: stations, PDs, buses, routes, events
 ? F1     this help
 q        quit
 Left out columns: a wider terminal shows them."""
@@ -318,11 +339,6 @@ _KEPT_ELSEWHERE = {
     "derived": "Route {name} follows from the ports in the plant file: write another one there.",
     "learned": "Route {name} is announced by the station itself.",
 }
-
-
-def run_view(plant: str | None) -> None:
-    """Show the live view until it is left."""
-    RoutesApp(RouterClient(plant)).run()
 
 
 _FIELDS = {

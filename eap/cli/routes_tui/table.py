@@ -1,21 +1,22 @@
-"""Rows and columns of the live view's table, and its widget, which keeps the cursor.
+"""Rows and columns of the live view of routes.
 
 The functions that make rows are pure: records in, texts out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import asyncio
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
-from typing import Any, NamedTuple
-
-from rich.text import Text
-from textual.widgets import DataTable
+from functools import partial
+from typing import Any, NamedTuple, Protocol
 
 from eap.cli import routes_view
-from eap.control.protocol import AnswerT, Method, ParametersT
+from eap.cli.top_tui.grid import GridColumn
+from eap.control.protocol import HELLO, AnswerT, Method, ParametersT
 from eap.control.routes import (
     ROUTES_ADD,
+    ROUTES_LIST,
     ROUTES_REMOVE,
     ROUTES_TEST,
     ConnectionRow,
@@ -23,7 +24,9 @@ from eap.control.routes import (
     RouterRow,
     TestResult,
 )
-from eap.errors import EapError
+from eap.errors import ControlError, EapError
+from eap.live.ads_connection import AdsConnection, RemoteHost
+from eap.live.client import LiveClient
 from eap.ops.client import connect_station
 from eap.ops.routing import list_routes
 
@@ -46,6 +49,22 @@ class Snapshot(NamedTuple):
 
     routers: list[PlantRouter]
     problem: str = ""
+
+
+class RouteRequests(Protocol):
+    """Requests of the view; they block."""
+
+    def fetch(self, match: str) -> Snapshot:
+        """Return all routers, with those of their routes that *match*; never raises EapError."""
+
+    def add(self, router: PlantRouter, params: dict[str, Any]) -> list[str]:
+        """Add a route, and return the warnings; raise EapError if refused."""
+
+    def remove(self, router: PlantRouter, route: str, transport: str, address: str) -> None:
+        """Remove a route; raise EapError if refused."""
+
+    def test(self, router: PlantRouter, target: str) -> TestResult:
+        """Test the path to *target* within seconds; raise EapError if refused."""
 
 
 class RouterClient:
@@ -82,11 +101,56 @@ class RouterClient:
             return client.call(method, within_s=_TEST_S, station=station, **params)
 
 
-_GAP = 1
-_EXTRA = 6
-"""Columns from this rank on are shown only where no text has to be cut for them."""
-_READABLE = 12
-"""A text is not cut to less than that while another column can be left out."""
+class RemoteRouters:
+    """Routers of other hosts, by ADS: they are shown, and changed on their hosts only.
+
+    Args:
+        hosts: ``HOST[:NETID]`` of each.
+    """
+
+    def __init__(self, hosts: Sequence[str]) -> None:
+        self._hosts = [RemoteHost.parse(host) for host in hosts]
+
+    def fetch(self, match: str) -> Snapshot:
+        """Return all routers, with those of their routes that *match*; never raises EapError."""
+        return asyncio.run(self._fetch(match))
+
+    def add(self, router: PlantRouter, params: dict[str, Any]) -> list[str]:
+        """Refuse with ControlError."""
+        raise _elsewhere(router)
+
+    def remove(self, router: PlantRouter, route: str, transport: str, address: str) -> None:
+        """Refuse with ControlError."""
+        raise _elsewhere(router)
+
+    def test(self, router: PlantRouter, target: str) -> TestResult:
+        """Refuse with ControlError."""
+        raise _elsewhere(router)
+
+    async def _fetch(self, match: str) -> Snapshot:
+        found = await asyncio.gather(*(self._routers(host, match) for host in self._hosts))
+        routers = {
+            (each.plant, each.routes.station): each
+            for snapshot in found
+            for each in snapshot.routers
+        }
+        problems = "; ".join(snapshot.problem for snapshot in found if snapshot.problem)
+        return Snapshot([*routers.values()], problems)
+
+    async def _routers(self, host: RemoteHost, match: str) -> Snapshot:
+        client = LiveClient(partial(AdsConnection.open, host))
+        try:
+            plant = (await client.call(HELLO)).plant
+            rows = await client.call(ROUTES_LIST, match=match, count=MOST, requests=_REQUESTS)
+        except EapError as exc:
+            return Snapshot([], f"{host}: {exc}")
+        finally:
+            await client.close()
+        return Snapshot([PlantRouter(plant, row) for row in rows])
+
+
+def _elsewhere(router: PlantRouter) -> ControlError:
+    return ControlError(f"{router.routes.station} runs on another host: use 'eapctl routes' there")
 
 
 class View(StrEnum):
@@ -95,24 +159,6 @@ class View(StrEnum):
     ROUTES = "routes"
     CONNECTIONS = "connections"
     WARNINGS = "warnings"
-
-
-class GridColumn(NamedTuple):
-    """A column.
-
-    Attributes:
-        heading: Above it.
-        least: Minimum width.
-        most: Maximum width; 0 uses the rest.
-        is_number: It is aligned to the right.
-        rank: 0 is always shown; a narrow screen omits the highest rank first.
-    """
-
-    heading: str
-    least: int
-    most: int
-    is_number: bool = False
-    rank: int = 0
 
 
 class Line(NamedTuple):
@@ -125,6 +171,10 @@ class Line(NamedTuple):
     cells: tuple[str, ...]
     state: str
     """``up``, ``down``, ``unknown``, or empty: its style."""
+
+    def style_of(self, number: int) -> str:
+        """Return the style of a text, empty for none."""
+        return STYLES[self.state] if number == _STATE and self.state else ""
 
 
 _STATION = GridColumn("Station", 7, 14)
@@ -158,6 +208,19 @@ COLUMNS = {
 }
 
 
+_STATE = 4
+"""Number of the column of a route's state."""
+
+
+def columns_of(view: View, *, has_station: bool) -> dict[int, GridColumn]:
+    """Return the columns of *view* by number."""
+    return {
+        number: column
+        for number, column in enumerate(COLUMNS[view])
+        if has_station or column is not _STATION
+    }
+
+
 def lines(view: View, routers: Iterable[PlantRouter], match: str) -> list[Line]:
     """Return the rows of *view*; routes are filtered by *match* already."""
     found = []
@@ -175,60 +238,6 @@ def lines(view: View, routers: Iterable[PlantRouter], match: str) -> list[Line]:
     if view is View.ROUTES:
         return found
     return [line for line in found if match.lower() in " ".join(line.cells).lower()]
-
-
-def fit(
-    view: View, found: Sequence[Line], width: int, *, has_station: bool
-) -> list[tuple[int, GridColumn, int]]:
-    """Return number, column and width of the columns that fit in *width* characters.
-
-    Columns are as wide as they need to be.  Where that is too wide, extra columns are left out, and
-    then long texts give way, the longest first; but before they become unreadable, more columns are
-    left out, those of the highest rank first.
-    """
-    chosen = {
-        number: column
-        for number, column in enumerate(COLUMNS[view])
-        if has_station or column is not _STATION
-    }
-    while (sizes := _sizes(chosen, found)) and _total(sizes.values()) > width:
-        worst = max(chosen, key=lambda number: chosen[number].rank)
-        rank = chosen[worst].rank
-        is_readable = _total(min(size, _READABLE) for size in sizes.values()) <= width
-        if not rank or (rank < _EXTRA and is_readable):
-            break
-        del chosen[worst]
-    while (excess := _total(sizes.values()) - width) > 0:
-        spare = {number: size - chosen[number].least for number, size in sizes.items()}
-        widest = max(spare, key=lambda number: (spare[number], sizes[number]))
-        if spare[widest] <= 0:
-            break
-        sizes[widest] -= 1
-    last = next(reversed(chosen))
-    if not chosen[last].most and excess < 0:
-        sizes[last] -= excess
-    return [(number, column, sizes[number]) for number, column in chosen.items()]
-
-
-def _sizes(chosen: Mapping[int, GridColumn], found: Sequence[Line]) -> dict[int, int]:
-    """Return the width that each column needs, between its bounds."""
-    sizes = {}
-    for number, column in chosen.items():
-        needed = max((len(line.cells[number]) for line in found), default=0)
-        needed = max(needed, len(column.heading), column.least if column.is_number else 0)
-        sizes[number] = min(needed, column.most) if column.most else column.least
-    return sizes
-
-
-def _total(sizes: Iterable[int]) -> int:
-    return sum(size + _GAP for size in sizes)
-
-
-def cut(text: str, size: int, *, is_number: bool) -> str:
-    """Return *text* in *size* characters."""
-    if len(text) > size:
-        text = f"{text[: size - 1]}…"
-    return text.rjust(size) if is_number else text
 
 
 def _route_line(router: PlantRouter, row: RouteRow) -> Line:
@@ -253,6 +262,17 @@ def _connection_line(router: PlantRouter, row: ConnectionRow) -> Line:
         routes_view.octets_of(row), routes_view.short(row.errors), row.last_error,
     )  # fmt: skip
     return Line(key, router, row, cells, "")
+
+
+STYLES = {
+    "up": "green",
+    "down": "bold red",
+    "unknown": "dim",
+    "client": "dim",
+    "bold": "bold",
+    "": "",
+}
+"""Colours of texts, by their content."""
 
 
 def detail(line: Line | None) -> list[tuple[str, str]]:
@@ -281,67 +301,3 @@ def detail(line: Line | None) -> list[tuple[str, str]]:
         for each in reversed(requests)
     ]
     return texts
-
-
-STYLES = {
-    "up": "green",
-    "down": "bold red",
-    "unknown": "dim",
-    "client": "dim",
-    "bold": "bold",
-    "": "",
-}
-"""Colours of texts, by their content."""
-
-
-class Grid(DataTable[Text]):
-    """Lines of a view, one of them chosen."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__(id=name, cursor_type="row", cell_padding=0)
-        self._lines: Sequence[Line] = ()
-        self._fitted: list[tuple[int, GridColumn, int]] = []
-
-    @property
-    def chosen(self) -> Line | None:
-        """The line that the cursor is on."""
-        at = self.cursor_row
-        return self._lines[at] if 0 <= at < len(self._lines) else None
-
-    def show_lines(
-        self, view: View, found: Sequence[Line], width: int, *, has_station: bool
-    ) -> None:
-        """Show *found* in *width* characters; the cursor stays on its line if that is there."""
-        fitted = fit(view, found, width, has_station=has_station)
-        before, chosen = [line.key for line in self._lines], self.chosen
-        self._lines = found
-        cells = [
-            [
-                Text(cut(line.cells[number], size, is_number=column.is_number),
-                     style=STYLES[line.state] if column.heading == "State" else "")
-                for number, column, size in fitted
-            ]
-            for line in found
-        ]  # fmt: skip
-        # Rebuilding moves cursor and scroll position; usually only cells have changed.
-        if (fitted, [line.key for line in found]) != (self._fitted, before):
-            self._fitted = fitted
-            self._lay_out(cells, chosen)
-            return
-        for number, row in enumerate(cells):
-            for place, cell in enumerate(row):
-                if self.get_cell_at((number, place)) != cell:  # type: ignore[arg-type]
-                    self.update_cell_at((number, place), cell)  # type: ignore[arg-type]
-
-    def _lay_out(self, cells: list[list[Text]], chosen: Line | None) -> None:
-        at = max(self.cursor_row, 0)
-        self.clear(columns=True)
-        for _, column, size in self._fitted:
-            heading = cut(column.heading, size, is_number=column.is_number)
-            self.add_column(Text(heading, style="bold"), width=size + 1)
-        self.add_rows(cells)
-        # By key and not by number: the cursor stays on its route when others come and go.
-        keys = [line.key for line in self._lines]
-        if chosen is not None and chosen.key in keys:
-            at = keys.index(chosen.key)
-        self.move_cursor(row=max(min(at, len(keys) - 1), 0))

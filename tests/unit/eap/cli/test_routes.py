@@ -145,13 +145,15 @@ def terminal(monkeypatch):
 
 def test_terminal_gets_the_live_view(command, terminal, monkeypatch):
     shown = []
-    monkeypatch.setattr("eap.cli.routes_tui.app.run_view", shown.append)
+    monkeypatch.setattr("eap.cli.top.run_app", lambda plant, **more: shown.append((plant, more)))
     assert command("--plant", "line").exit_code == 0
-    assert shown == ["line"]
+    options = {"tab": "routes", "may_write": True, "instead": "'eapctl routes list'"}
+    assert shown == [("line", options)]
 
 
 def test_routes_without_textual_names_the_extra(command, terminal, monkeypatch):
-    for name in [name for name in sys.modules if name.startswith("eap.cli.routes_tui")]:
+    ours = ("eap.cli.routes_tui", "eap.cli.top_tui")
+    for name in [name for name in sys.modules if name.startswith(ours)]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "textual", None)
     result = command()

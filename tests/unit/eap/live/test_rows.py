@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from eap.live.rows import NO_CYCLES, StationRow, pd_flows, station_rows
+from eap.live.rows import NO_CYCLES, StationRow, bus_rows, pd_flows, station_rows
 from tests.support.statusdocument import bus_port, document, rx, tx, with_findings
 
 
@@ -72,3 +72,25 @@ def test_pd_flows_show_both_directions() -> None:
 def test_pd_flow_of_unknown_step_has_no_losses() -> None:
     now = at(1100, rx=[rx("in", lost=None)])
     assert only(pd_flows(now)).lost is None
+
+
+def test_bus_rows_show_the_bus_and_then_its_slaves() -> None:
+    first, now = at(1, ports=[bus_port(lost=1)]), at(2, ports=[bus_port(lost=5)])
+    bus, drive, press = bus_rows(now, first)
+    assert (bus.port, bus.name, bus.state, bus.lost, bus.wkc) == ("bus0", "", "up", 4, 0)
+    assert (drive.name, drive.address, drive.state, drive.fault) == ("drive", 1001, "OP", "")
+    assert (press.name, press.state, press.target, press.fault) == (
+        "press", "lost", "OP", "is lost"
+    )  # fmt: skip
+
+
+def test_bus_that_the_engine_does_not_report_is_unknown() -> None:
+    port = bus_port()
+    del port["bus"]
+    assert only(bus_rows(at(1, ports=[port]))).state == "unknown"
+
+
+def test_station_row_has_the_age_of_pds_that_come_in_a_fixed_step() -> None:
+    received = [rx("a", age_us=10), rx("b", age_us=30), rx("alarm", age_us=9000, lost=None)]
+    assert only(station_rows(at(1, rx=received))).age_us == 30
+    assert only(station_rows(at(1, rx=received[2:]))).age_us == 9000

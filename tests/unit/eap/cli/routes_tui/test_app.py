@@ -9,15 +9,13 @@ import msgspec
 import pytest
 
 from eap.cli.routes_tui import app
-from eap.cli.routes_tui.app import RoutesApp
 from eap.cli.routes_tui.table import RouterClient
 from tests.support.controlstub import ControlStub
 from tests.support.fakeroutes import ISLAND, PRESS, FakeRoutes
+from tests.support.liveviews import routes_app
 from tests.support.screens import Screen, play
 
 SIZE = 80, 24
-NEVER_S = 1000.0
-"""Period of a view that looks only when it is told to."""
 
 
 @pytest.fixture
@@ -32,11 +30,11 @@ def stub(fake, runtime):
 
 
 def run(script, size=SIZE):
-    play(RoutesApp(RouterClient(None), period_s=NEVER_S), script, size)
+    play(routes_app(RouterClient(None)), script, size)
 
 
 async def look(screen: Screen) -> str:
-    screen.app.fetch()
+    screen.app.screen.fetch()
     return await screen.settle()
 
 
@@ -56,7 +54,7 @@ def test_everything_fits_80_by_24(stub):
         assert shown[16] == " island-02  127.0.1.2.*.*  127.0.1.2:34980 by udp:eap0"
         assert shown[17] == " derived; up: round trip 840 µs"
         assert "READ 127.0.1.2.2.1:65535 < 127.0.0.1.1.1:32905: 1.2 ms" in shown[19]
-        assert shown[23] == "a Add e Edit d Remove t Test / Filter ? Help q Quit"
+        assert shown[23] == "a Add e Edit d Remove t Test / Filter ? Help 1-5 View q Quit"
 
     run(script)
 
@@ -70,7 +68,7 @@ def test_everything_fits_60_by_15(stub):
         assert shown[3].split() == [
             "island-01", "island-02", "127.0.1.2.*.*", "up", "840", "µs", "0"
         ]  # fmt: skip
-        assert shown[14] == "a Add e Edit d Remove t Test / Filter ? Help q Quit"
+        assert shown[14] == "a Add e Edit d Remove t Test / Filter ? Help 1-5 View q Quit"
         assert not any("…" in line for line in shown[1:8])
 
     run(script, (60, 15))
@@ -288,8 +286,8 @@ def test_view_reports_an_appliance_that_hangs(stub, fake, monkeypatch):
 
     async def script(screen):
         stub._methods["routes_list"] = hang
-        screen.app.fetch()
-        screen.app.fetch()
+        screen.app.screen.fetch()
+        screen.app.screen.fetch()
         await screen.pilot.pause()
         assert screen.text().startswith(" no answer for 0 s")
         goes_on.set()
@@ -300,7 +298,7 @@ def test_view_reports_an_appliance_that_hangs(stub, fake, monkeypatch):
 
 
 def test_view_refreshes_periodically(stub):
-    app = RoutesApp(RouterClient("line"), period_s=0.1)
+    app = routes_app(RouterClient("line"), period_s=0.1)
 
     async def script(screen):
         while len(stub.requests) < 4:

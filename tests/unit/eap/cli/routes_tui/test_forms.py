@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import msgspec
 
-from eap.cli.routes_tui.app import Message, Question, RouteForm, RoutesApp, values_of
+from eap.cli.routes_tui.app import Message, Question, RouteForm, values_of
 from eap.cli.routes_tui.table import RouterClient
 from eap.errors import ControlError
 from tests.support.fakeroutes import ISLAND, PRESS
+from tests.support.liveviews import routes_app
 from tests.support.screens import play
 
 
 def run(script):
-    play(RoutesApp(RouterClient(None), period_s=1000.0), script)
+    play(routes_app(RouterClient(None)), script)
 
 
 def test_form_for_a_change_begins_with_the_route() -> None:

@@ -3,14 +3,15 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from eap.cli.routes_tui.table import PlantRouter, View, cut, detail, fit, lines
+from eap.cli.routes_tui.table import PlantRouter, View, columns_of, detail, lines
+from eap.cli.top_tui.grid import cut, fit
 from tests.support.fakeroutes import ISLAND, FakeRoutes
 
 ROUTER = PlantRouter("line", FakeRoutes().stations["island-01"])
 
 
 def widths(view: View, width: int, *, has_station: bool = True) -> dict[str, int]:
-    fitted = fit(view, lines(view, [ROUTER], ""), width, has_station=has_station)
+    fitted = fit(columns_of(view, has_station=has_station), lines(view, [ROUTER], ""), width)
     return {column.heading: size for _, column, size in fitted}
 
 
@@ -39,7 +40,7 @@ def test_long_texts_are_cut_to_their_minimum(view: View, width: int) -> None:
     )
     routes = msgspec.structs.replace(ROUTER.routes, station="station-of-cell-17", routes=[names])
     found = lines(view, [ROUTER._replace(routes=routes)], "")
-    fitted = fit(view, found, width, has_station=True)
+    fitted = fit(columns_of(view, has_station=True), found, width)
     assert sum(size + 1 for _, _, size in fitted) <= width
 
 
