@@ -15,11 +15,12 @@ from time import monotonic_ns
 from eap.engine.rebuild import EngineStation
 from eap.net.framering_file import FrameRingFile
 from eap.pd.address import source_word, to_word
-from eap.pd.framering import MAX_FRAME, FrameRingWriter
+from eap.pd.framering import MAX_FRAME, FrameRingWriter, SentFrame
 from eap.pd.link import FrameChannel, FrameHandler, FrameOrigin, OutFrame
 
-_address_of = lru_cache(1024)(to_word)  # the same destinations again and again
-_source_of = lru_cache(1024)(source_word)
+_source_of = lru_cache(1024)(source_word)  # the same ones send again and again
+_KNOWN = 1024
+_GROUP = 64
 
 
 class FrameTap:
@@ -34,7 +35,7 @@ class FrameTap:
         add, number = self._ring.add, self._number
 
         def record(data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
-            add(number, at_ns, _source_of(origin.source_of(data)), data[: min(size, MAX_FRAME)])
+            add(number, at_ns, _source_of(origin.source_of(data)), data[:size][:MAX_FRAME])
             handle(data, size, at_ns, origin)
 
         return record
@@ -49,8 +50,9 @@ class _RecordingChannel:
 
     def __init__(self, channel: FrameChannel, ring: FrameRingWriter, number: int) -> None:
         self._channel = channel
-        self._add = ring.add
+        self._ring = ring
         self._number = number
+        self._known: dict[OutFrame, SentFrame] = {}
         self.drain = channel.drain
         self.exchange_handler = channel.exchange_handler
         self.link_header = channel.link_header
@@ -62,13 +64,25 @@ class _RecordingChannel:
         # The time for loopback lines, too: what is received there has the time of the sending.
         at_ns = monotonic_ns()
         failed = self._channel.send(frames, at_ns)
-        add, number = self._add, self._number
-        for frame in frames:
-            if failed and frame in failed:
-                continue
-            address = _address_of(frame.destination)
-            add(number, at_ns, address, frame.view[frame.headroom :], is_sent=True)
+        known = self._known
+        sent = [
+            known.get(frame) or self._describe(frame)
+            for frame in frames
+            if not failed or frame not in failed
+        ]
+        # In groups, each of which certainly fits into the ring.
+        for first in range(0, len(sent), _GROUP):
+            self._ring.add_sent(self._number, at_ns, sent[first : first + _GROUP])
         return failed
+
+    def _describe(self, frame: OutFrame) -> SentFrame:
+        """Return *frame* for the ring; it holds for the life of the frame."""
+        if len(self._known) >= _KNOWN:
+            self._known.clear()  # requesters may forge any number of addresses
+        octets = frame.view[frame.headroom : frame.headroom + MAX_FRAME]
+        described = SentFrame.of(to_word(frame.destination), octets)
+        self._known[frame] = described
+        return described
 
 
 class FrameRecording:

@@ -34,6 +34,8 @@ RECORDING_TERM_NS = 1_000_000_000
 
 _HEAD = struct.Struct("<HHIqQ")
 """Port and direction, length of the frame, number of the record, time, address of the other end."""
+_HEAD_SIZE = _HEAD.size
+_pack_head = _HEAD.pack_into
 _REST = 0xFFFF
 _SENT = 0x8000
 _ALIGN = 7
@@ -110,6 +112,19 @@ class RingHeader:
         self.words[_CAPACITY] = size
 
 
+class SentFrame(NamedTuple):
+    """A frame to record: the address of its destination, its bytes, and those of its record."""
+
+    address: int
+    frame: memoryview
+    step: int
+
+    @classmethod
+    def of(cls, address: int, frame: memoryview) -> SentFrame:
+        """Return *frame*, from its EtherCAT header on, for any number of records."""
+        return cls(address, frame, (_HEAD_SIZE + len(frame) + _ALIGN) & ~_ALIGN)
+
+
 class FrameRingWriter:
     """Writes records; the engine's side.
 
@@ -145,30 +160,52 @@ class FrameRingWriter:
         number = self._numbers[port] = len(self._numbers)
         return number
 
-    def add(
-        self, port: int, at_ns: int, address: int, frame: memoryview, *, is_sent: bool = False
-    ) -> None:
-        """Write one record.
+    def add(self, port: int, at_ns: int, address: int, frame: memoryview) -> None:
+        """Write one record of a frame that was received.
 
         Args:
             port: Number of the port.
             at_ns: Time on the monotonic clock.
-            address: Of the other end, a word of ``eap.pd.address``.
+            address: Of the sender, a word of ``eap.pd.address``.
             frame: From its EtherCAT header on; MAX_FRAME bytes at most.
-            is_sent: Whether the port sent it.
         """
+        # This and add_sent are called for each frame and each cycle: no attribute twice.
         size = len(frame)
-        step = (_HEAD.size + size + _ALIGN) & ~_ALIGN
-        if self._at + step > self._capacity:
+        at = self._at
+        after = at + ((_HEAD_SIZE + size + _ALIGN) & ~_ALIGN)
+        if after > self._capacity:
+            self._begin_lap()
+            after -= at
+            at = 0
+        words, ring = self._words, self._ring
+        words[_RESERVED] = end = words[_WRITTEN] + after - at
+        self._records = number = self._records + 1
+        start = at + _HEAD_SIZE
+        _pack_head(ring, at, port, size, number & 0xFFFFFFFF, at_ns, address)
+        ring[start : start + size] = frame
+        self._at = after
+        words[_RECORDS] = number
+        words[_WRITTEN] = end
+
+    def add_sent(self, port: int, at_ns: int, frames: Sequence[SentFrame]) -> None:
+        """Write a record of each of *frames*, which left at one time."""
+        total = 0
+        for _, _, step in frames:
+            total += step
+        if self._at + total > self._capacity:
             self._begin_lap()
         words, ring, at = self._words, self._ring, self._at
-        end = words[_WRITTEN] + step
-        words[_RESERVED] = end
-        self._records = number = self._records + 1
-        head = port | _SENT if is_sent else port
-        _HEAD.pack_into(ring, at, head, size, number & 0xFFFFFFFF, at_ns, address)
-        ring[at + _HEAD.size : at + _HEAD.size + size] = frame
-        self._at = at + step
+        words[_RESERVED] = end = words[_WRITTEN] + total
+        number, head = self._records, port | _SENT
+        for address, frame, step in frames:
+            number += 1
+            size = len(frame)
+            start = at + _HEAD_SIZE
+            _pack_head(ring, at, head, size, number & 0xFFFFFFFF, at_ns, address)
+            ring[start : start + size] = frame
+            at += step
+        self._at = at
+        self._records = number
         words[_RECORDS] = number
         words[_WRITTEN] = end
 

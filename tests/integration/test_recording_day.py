@@ -55,7 +55,7 @@ def frames() -> Callable[[int, int], Block]:
     writer.number("s/eap0")
 
     def block(number: int, time_ns: int) -> Block:
-        writer.add(0, time_ns, 0, memoryview(os.urandom(900)), is_sent=bool(number % 2))
+        writer.add(0, time_ns, 0, memoryview(os.urandom(900)))
         (run,) = reader.runs()
         return Block("", time_ns, time_ns, run.octets)
 

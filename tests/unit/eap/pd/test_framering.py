@@ -14,6 +14,7 @@ from eap.pd.framering import (
     FrameRingWriter,
     RingHeader,
     RingWord,
+    SentFrame,
     records_in,
 )
 
@@ -34,8 +35,10 @@ class Ring:
         return FrameRingReader(RingHeader(self.memory), self.memory)
 
     def add(self, *frames, port=0):
-        for frame in frames:
-            self.writer.add(port, len(frame), 0, memoryview(frame))
+        if len(frames) > 1:
+            self.writer.add_sent(port, 0, [SentFrame.of(0, memoryview(each)) for each in frames])
+        else:
+            self.writer.add(port, 0, 0, memoryview(frames[0]))
 
 
 def taken(reader):
@@ -51,10 +54,14 @@ def test_reader_gets_what_is_written_after_it_came():
     ring.add(b"before")
     reader = ring.reader()
     assert taken(reader) == ([], 0)
-    ring.writer.add(3, 77, 0x2_7F000101_0000, memoryview(b"\x10\x40abc"), is_sent=True)
+    ring.writer.add(3, 77, 0x2_7F000101_0000, memoryview(b"\x10\x40abc"))
+    sent = [SentFrame.of(number, memoryview(b"x" * number)) for number in range(3)]
+    ring.writer.add_sent(4, 78, sent)
     (run,) = reader.runs()
-    (record,) = records_in(run.octets)
-    assert record == (3, True, 77, 0x2_7F000101_0000, b"\x10\x40abc")
+    assert list(records_in(run.octets)) == [
+        (3, False, 77, 0x2_7F000101_0000, b"\x10\x40abc"),
+        *((4, True, 78, number, b"x" * number) for number in range(3)),
+    ]
     assert taken(reader) == ([], 0)
 
 
@@ -84,22 +91,25 @@ def test_reader_drops_frames_of_other_ports():
     assert [each.frame for each in records_in(run.octets, [True, False])] == [b"a"]
 
 
-@given(st.lists(st.tuples(st.binary(max_size=300), st.booleans()), max_size=60))
+FRAMES = st.lists(st.binary(max_size=300), min_size=1, max_size=3)
+
+
+@given(st.lists(st.tuples(FRAMES, st.booleans()), max_size=40))
 def test_frames_are_read_in_order_or_counted_as_lost(steps):
     ring = Ring()
     reader = ring.reader()
     written, read, lost = [], [], 0
-    for frame, looks in steps:
-        ring.add(frame)
-        written.append(frame)
+    for frames, looks in steps:
+        ring.add(*frames)
+        written += frames
         if looks:
-            frames, missed = taken(reader)
+            found, missed = taken(reader)
             lost += missed
-            read += frames
+            read += found
             # All that is not lost comes in order, up to the frame written last.
-            assert frames == written[len(written) - len(frames) :]
-    frames, missed = taken(reader)
-    assert len(read + frames) + lost + missed == len(written)
+            assert found == written[len(written) - len(found) :]
+    found, missed = taken(reader)
+    assert len(read + found) + lost + missed == len(written)
 
 
 def test_slow_reader_counts_what_was_overwritten():

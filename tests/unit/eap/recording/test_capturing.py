@@ -10,6 +10,7 @@ from eap.errors import ImageError
 from eap.expressions import Condition
 from eap.net.framering_file import FrameRingFile
 from eap.net.image_file import create_image, prepare_image
+from eap.pd.framering import SentFrame
 from eap.pd.image import Inputs, Sampler
 from eap.pd.layout import plan_layout
 from eap.pd.spec import VariableSpec, Writer
@@ -167,7 +168,7 @@ def test_frames_come_with_port_direction_and_time(tmp_path):
         assert file.header.is_wanted(monotonic_ns())
         writer = file.writer()
         assert [writer.number("left/eap0"), writer.number("right/eap0")] == [0, 1]
-        writer.add(0, 100, 0, memoryview(b"abc"), is_sent=True)
+        writer.add_sent(0, 100, [SentFrame.of(0, memoryview(b"abc"))])
         writer.add(1, 200, 0, memoryview(b"defg"))
         assert capture.ports == ["left/eap0", "right/eap0"]
         (block,) = capture.look(1000).blocks
