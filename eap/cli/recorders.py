@@ -101,7 +101,7 @@ def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -
     " Default: the plant's name.",
 )
 @click.option("--values", "kind", flag_value="values", help="Record variables (default).")
-@click.option("--frames", "kind", flag_value="frames", help="Record frames of EAP ports.")
+@click.option("--frames", "kind", flag_value="frames", help="Record frames of EAP and bus ports.")
 @click.option(
     "--every",
     default="1",

@@ -248,7 +248,12 @@ class EngineBus:
 
     def filenos(self) -> list[int]:
         """Return the descriptor of each line, which becomes readable when a frame waits."""
-        return [each.fileno() for each in (self._port, self._second) if each is not None]
+        return [each.fileno() for each in self.lines]
+
+    @property
+    def lines(self) -> list[BusPort]:
+        """The ports of all lines."""
+        return [each for each in (self._port, self._second) if each is not None]
 
     def close(self) -> None:
         """Close the ports of all lines."""

@@ -8,7 +8,7 @@ is never received before it was sent.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from time import monotonic_ns
 
@@ -104,8 +104,7 @@ class FrameRecording:
         if not self._file.header.is_wanted(now_ns):
             if self._is_on:
                 self._is_on = False
-                for entry in self._stations.values():
-                    entry.station.untap()
+                self._untap()
             return
         if self._ring is None:
             self._ring = self._file.writer()
@@ -119,3 +118,31 @@ class FrameRecording:
                 number = ring.number(f"{name}/{port}")
                 if number is not None:
                     entry.station.tap(port, FrameTap(ring, number))
+            for port, bus in entry.buses.items():
+                if any(line.tap is None for line in bus.lines):
+                    number = ring.number(f"{name}/{port}")
+                    tap = None if number is None else _bus_tap(ring, number)
+                    for line in bus.lines:
+                        line.tap = tap
+
+    def _untap(self) -> None:
+        for entry in self._stations.values():
+            entry.station.untap()
+            for bus in entry.buses.values():
+                for line in bus.lines:
+                    line.tap = None
+
+
+def _bus_tap(ring: FrameRingWriter, number: int) -> Callable[[bytes, bool], None]:
+    """Return the observer of the frames of a bus, both of whose lines have one."""
+    add, add_sent = ring.add, ring.add_sent
+
+    def record(frame: bytes, is_sent: bool) -> None:
+        # Drivers of buses read no time stamps of the kernel.
+        view, at_ns = memoryview(frame)[:MAX_FRAME], monotonic_ns()
+        if is_sent:
+            add_sent(number, at_ns, (SentFrame.of(0, view),))
+        else:
+            add(number, at_ns, 0, view)
+
+    return record

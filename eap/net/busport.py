@@ -13,6 +13,7 @@ import errno
 import os
 import socket
 import struct
+from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -42,9 +43,13 @@ class BusPort:
         interface: Name of the Ethernet interface; by default the one that *sock* is bound to.
         source: Source address of the frames; by default that of the interface.  Both lines of a
             ring have one, for the frames of each arrive on the other.
+
+    Attributes:
+        tap: Observer of each frame, from its EtherCAT header on, and whether it was sent.
     """
 
     def __init__(self, sock: socket.socket, *, interface: str = "", source: bytes = b"") -> None:
+        self.tap: Callable[[bytes, bool], None] | None = None
         self._sock = sock
         self._interface = ""
         self._header = b""
@@ -75,6 +80,8 @@ class BusPort:
             EnvironmentalError: the interface is gone or switched off.
         """
         octets = (self._header + frame).ljust(_MINIMUM, b"\0") if self._header else frame
+        if self.tap is not None:
+            self.tap(frame, True)
         try:
             self._sock.send(octets)
         except _LOST:
@@ -99,11 +106,14 @@ class BusPort:
                 return None
             except OSError as error:
                 raise EnvironmentalError(f"the bus cannot be reached: {error.strerror}") from None
-            if not self._header:
-                return data or None
-            # Without bit 1, which the first slave sets (ETG.1000.4) and some emulators do not.
-            if len(data) > _HEADER and _source(data) == _source(self._header):
-                return data[_HEADER:]
+            if self._header:
+                # Without bit 1, which the first slave sets (ETG.1000.4) and some emulators do not.
+                if len(data) <= _HEADER or _source(data) != _source(self._header):
+                    continue
+                data = data[_HEADER:]
+            if data and self.tap is not None:
+                self.tap(data, False)
+            return data or None
 
     def _join_again(self) -> None:
         """Find the interface that was taken away, if another of its name has come."""

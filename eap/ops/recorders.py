@@ -143,12 +143,7 @@ def _check_names(folder: ApplianceFolder, info: ApplianceInfo, options: Recorder
         ]
         check_patterns(options.patterns, known, "variable")
     else:
-        known = [
-            f"{each.station}/{port.name}"
-            for each in layouts
-            for port in each.ports
-            if port.kind == "eap"
-        ]
+        known = [f"{each.station}/{port.name}" for each in layouts for port in each.ports]
         check_patterns(options.patterns, known, "port")
     if options.when:
         for name in Condition(options.when).names:

@@ -162,7 +162,6 @@ class Attachment(Closeable):
             is_selected(f"{layout.station}/{port.name}")
             for layout in self.layouts
             for port in layout.ports
-            if port.kind == "eap"
         )
 
     @property

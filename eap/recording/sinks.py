@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from eap.codec.ethercat import EAP_PORT
+from eap.codec.ethercat import EAP_PORT, FrameType
 from eap.ids import EAP_MULTICAST_MAC, Destination, DestinationKind, InterfaceUri, MacAddr, NetId
+from eap.net.busport import BUS_MULTICAST_MAC
 from eap.pd.address import from_word
 from eap.pd.framering import RingRecord
 from eap.pd.layout import ImageLayout
@@ -24,6 +25,7 @@ from eap.runtime.folder import ApplianceInfo
 
 _PUBLISHER = slice(2, 8)
 """Of a frame of process data: the NetID of its sender."""
+_PROCESSED = 0x02
 _WRAPPINGS = 4096
 
 
@@ -154,7 +156,9 @@ class FramesSink:
         self._writer = FramesWriter(path, header)
         self._is_selected = matcher(patterns)
         self._addressing = {
-            f"{layout.station}/{port.name}": PortAddressing(port.interface, port.net_id)
+            f"{layout.station}/{port.name}": PortAddressing(
+                port.interface, port.net_id, is_bus=port.kind == "bus"
+            )
             for layout in layouts
             for port in layout.ports
         }
@@ -216,8 +220,10 @@ class FramesSink:
         return self._interfaces[port]
 
     def _wrapping(self, record: RingRecord) -> Wrapping:
-        # A line in memory has no addresses: the sender stands in the frame.
-        publisher = b"" if record.address else record.frame[_PUBLISHER]
+        # A line in memory has no addresses: the sender stands in frames of process data.
+        frame = record.frame
+        is_process_data = len(frame) > 1 and frame[1] >> 4 == FrameType.PROCESS_DATA
+        publisher = frame[_PUBLISHER] if is_process_data and not record.address else b""
         key = record.port, record.is_sent, record.address, publisher
         found = self._wrappings.get(key)
         if found is None:
@@ -234,10 +240,12 @@ class PortAddressing:
     Args:
         interface: Its URI.
         net_id: Its NetID.
+        is_bus: Whether it is the port of a bus of slaves.
     """
 
-    def __init__(self, interface: str, net_id: str) -> None:
+    def __init__(self, interface: str, net_id: str, *, is_bus: bool = False) -> None:
         self.interface = interface
+        self._is_bus = is_bus
         self._mac = _mac_of(bytes(NetId.parse(net_id))) if net_id else EAP_MULTICAST_MAC
         self._udp: tuple[str, int] | None = None
         uri = InterfaceUri.parse(interface) if interface else None
@@ -248,6 +256,10 @@ class PortAddressing:
 
     def wrapping(self, record: RingRecord, publisher: bytes) -> Wrapping:
         """Return the headers of *record*; *publisher* is its sender where it has no address."""
+        if self._is_bus:
+            # The first slave sets a bit of the source address in what it sends on (ETG.1000.4).
+            first = self._mac[0] & ~_PROCESSED if record.is_sent else self._mac[0] | _PROCESSED
+            return ethernet_wrapping(MacAddr(bytes((first,)) + self._mac[1:]), BUS_MULTICAST_MAC)
         other = from_word(record.address)
         if other is not None and self._udp is not None and other.kind is not DestinationKind.MAC:
             peer = other.host, other.port or EAP_PORT

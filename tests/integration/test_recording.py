@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from eap.recording.frames_reader import FramesFile
 from eap.recording.recording_file import describe, iso_time, open_recording
 from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
 
@@ -27,6 +28,7 @@ stations:
     ports:
       - {name: eap0, kind: eap, interface: "udp://127.9.61.1", net_id: 127.9.61.1.2.1}
       - {name: eap1, kind: eap, interface: "loop://short", net_id: 127.9.61.1.3.1}
+      - {name: bus0, kind: bus, interface: "sim://oven.yaml", net_id: 127.9.61.1.4.1}
     variables:
       ticks: UDINT
       level: {type: REAL, unit: mm}
@@ -48,10 +50,19 @@ stations:
       - {name: again, port: eap1, from: left/again, variables: {near_ticks: UDINT}}
 """
 
+OVEN = """\
+bus: oven
+slaves:
+  - name: door
+    kind: digital
+    inputs: [{name: is_closed}]
+"""
+
 
 @pytest.fixture(scope="module")
 def line(module_farm: Plants) -> Appliance:
     """One plant for all tests that do not end it."""
+    module_farm.write(OVEN, "oven.yaml")
     return module_farm.run(module_farm.write(PLANT))
 
 
@@ -96,11 +107,11 @@ def recordings(line: Appliance, tmp_path: Path) -> Iterator[Recordings]:
 
 def test_values_of_every_cycle_are_recorded_until_the_stop(recordings: Recordings) -> None:
     started = recordings.start("values", "left", "right/near_*")
-    assert (started["state"], started["selected"], started["kind"]) == ("recording", 7, "values")
+    assert (started["state"], started["selected"], started["kind"]) == ("recording", 11, "values")
     recordings.wait_messages("values", 40)
     recordings.appliance.command("record", "mark", "door open")
     rows = {each["where"]: each["what"] for each in recordings.appliance.status()["findings"]}
-    assert rows["recording values"] == "recording, 7 variables"
+    assert rows["recording values"] == "recording, 11 variables"
     ended = recordings.stop("values")
     assert (ended["state"], ended["lost"]) == ("ended", 0)
     (path,) = ended["files"]
@@ -113,13 +124,22 @@ def test_values_of_every_cycle_are_recorded_until_the_stop(recordings: Recording
 
 
 def test_frames_of_all_kinds_of_ports_are_recorded_on_both_sides(recordings: Recordings) -> None:
-    assert recordings.start("frames", "--frames")["selected"] == 4
+    assert recordings.start("frames", "--frames")["selected"] == 5
     recordings.wait_messages("frames", 100)
     ended = recordings.stop("frames")
     info = describe(Path(ended["files"][0]))
     assert (info.lost, info.kind) == (0, "frames")
-    assert sorted(info.interfaces) == ["left/eap0", "left/eap1", "right/eap0", "right/eap1"]
+    ports = ["left/bus0", "left/eap0", "left/eap1", "right/eap0", "right/eap1"]
+    assert sorted(info.interfaces) == ports
     assert info.messages == ended["messages"]
+    recording = open_recording(Path(ended["files"][0]))
+    assert isinstance(recording, FramesFile)
+    found = {
+        (recording.interfaces[each.captured.interface], each.captured.outbound, each.data[1] >> 4)
+        for each in recording.frames()
+    }
+    on_bus = {("left/bus0", True, 1), ("left/bus0", False, 1)}
+    assert found == on_bus | {(port, port.startswith("left"), 4) for port in ports[1:]}
 
 
 def test_recorder_goes_on_when_processes_are_killed(recordings: Recordings) -> None:
@@ -152,13 +172,13 @@ def test_recording_that_is_killed_is_listed_and_readable(recordings: Recordings)
     assert "no recording 'dead' runs" in refused.stderr
 
 
-def test_changed_station_begins_another_file(recordings: Recordings) -> None:
-    changed = recordings.folder / "changed.yaml"
+def test_changed_station_begins_another_file(recordings: Recordings, module_farm: Plants) -> None:
     plant = recordings.appliance
     recordings.start("before", "left")
     recordings.start("beside", "right")
     recordings.wait_messages("before", 20)
-    changed.write_text(PLANT.replace("      level: {", "      more: LINT\n      level: {"))
+    text = PLANT.replace("      level: {", "      more: LINT\n      level: {")
+    changed = module_farm.write(text, "changed.yaml")
     plant.command("apply", str(changed))
     wait_until(lambda: len(recordings.state("before")["files"]) == 2)
     recordings.wait_messages("before", 20)
@@ -274,6 +294,7 @@ def test_file_that_exists_is_not_overwritten(recordings: Recordings) -> None:
 
 
 def test_recording_waits_while_its_plant_does_not_run(farm: Plants, tmp_path: Path) -> None:
+    farm.write(OVEN, "oven.yaml")
     plant = farm.write(PLANT.replace("127.9.61", "127.9.62"))
     first = farm.run(plant)
     recordings = Recordings(first, tmp_path)

@@ -61,6 +61,15 @@ def test_pair(pair):
     assert exchange(*pair) == FRAME[:2] + b"\x08" + FRAME[3:]
 
 
+def test_tap_of_a_bus_port_sees_what_is_sent_and_received(pair):
+    seen = []
+    pair[0].tap = lambda frame, is_sent: seen.append((frame, is_sent))
+    exchange(*pair)
+    assert seen == [(FRAME, True), (FRAME[:2] + b"\x08" + FRAME[3:], False)]
+    assert pair[0].receive() is None
+    assert len(seen) == 2
+
+
 def test_bus_port_loses_frames_while_other_end_does_not_read(pair):
     master, far = pair
     for _ in range(2000):
