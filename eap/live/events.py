@@ -65,7 +65,9 @@ class EventLog:
 
     def __init__(self, *, most: int = MAX_EVENTS) -> None:
         self.events: deque[LiveEvent] = deque(maxlen=most)
-        self._before: StatusReport | None = None
+        # The last ones known: an appliance that does not answer for a moment is not new afterwards.
+        self._appliances: dict[tuple[str, tuple[str, ...]], ApplianceStatus] = {}
+        self._stations: dict[StationKey, Row] = {}
         self._faults: dict[_FaultKey, _Fault] = {}
         self._episodes: dict[_EpisodeKey, _Episode] = {}
         self._silent: dict[str, int] = {}
@@ -93,7 +95,8 @@ class EventLog:
             *self._restarts(report),
             *self._reachability(unreachable, now_ns),
         ]
-        self._before = report
+        self._appliances |= _appliances(report)
+        self._stations |= stations_of(report)
         events = [LiveEvent(round(now_s, 3), *each) for each in found]
         self.events.extend(events)
         return events
@@ -108,12 +111,10 @@ class EventLog:
             yield _Found(Severity.INFO, name, name, f"answers again after {lasted}")
 
     def _restarts(self, report: StatusReport) -> Iterator[_Found]:
-        before = {} if self._before is None else _appliances(self._before)
         for key, appliance in _appliances(report).items():
-            if key not in before:
+            if (earlier := self._appliances.get(key)) is None:
                 continue
             label = appliance_label(report, appliance)
-            earlier = before[key]
             if appliance.processes["supervisor"]["pid"] != earlier.processes["supervisor"]["pid"]:
                 what = "the appliance was started again"
                 yield _Found(Severity.WARNING, appliance.plant, label, what)
@@ -128,9 +129,8 @@ class EventLog:
                     yield _Found(Severity.ERROR, appliance.plant, f"{label} {name}", what, advice)
 
     def _states(self, report: StatusReport) -> Iterator[_Found]:
-        before = stations_of(self._before)
         for key, station in stations_of(report).items():
-            if (earlier := before.get(key)) is None:
+            if (earlier := self._stations.get(key)) is None:
                 continue
             plant, name = key
             if station["state"] != earlier["state"]:
@@ -172,15 +172,18 @@ class EventLog:
             else:
                 self._faults[key] = _Fault(each, now_ns)
                 yield _Found(each.severity, each.plant, each.where, each.what, each.advice)
+        answering = {each.plant for each in report.appliances}
         for key, fault in before.items():
+            if key.plant not in answering:  # nothing is known about it now
+                self._faults[key] = fault
+                continue
             first = key.what.partition("; ")[0]
             what = f"over after {_lasted(now_ns - fault.began_ns)}: {first}"
             yield _Found(Severity.INFO, key.plant, key.where, what)
 
     def _counts(self, report: StatusReport, now_ns: int) -> Iterator[_Found]:
-        before = stations_of(self._before)
         for key, station in stations_of(report).items():
-            earlier = before.get(key)
+            earlier = self._stations.get(key)
             if earlier is not None:
                 for kind in _KINDS:
                     yield from self._count(kind, key, station, earlier, now_ns)

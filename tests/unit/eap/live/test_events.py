@@ -53,6 +53,14 @@ def test_restarted_engine_is_one_event(reports: Reports) -> None:
     assert reports.take(engine(1, pid=555)) == []
 
 
+def test_restart_behind_a_gap_of_answers_is_an_event(reports: Reports) -> None:
+    reports.take(engine(0))
+    nothing = document() | {"stations": [], "appliances": []}
+    reports.take(nothing, {"line": "does not answer"})
+    found = reports.take(engine(1, pid=555))
+    assert found[0] == "error line engine: ended and was restarted (once since the start)"
+
+
 def test_fault_is_an_event_when_it_begins_and_when_it_is_over(reports: Reports) -> None:
     reports.take(document())
     down = document(
@@ -61,6 +69,15 @@ def test_fault_is_an_event_when_it_begins_and_when_it_is_over(reports: Reports) 
     assert reports.take(down) == ["error mixer/eap0: link down"]
     assert reports.take(down) == []
     assert reports.take(document()) == ["info mixer/eap0: over after 2.0 s: link down"]
+
+
+def test_fault_is_not_over_because_its_appliance_does_not_answer(reports: Reports) -> None:
+    port = {"name": "eap0", "kind": "eap", "interface": "ethernet://e", "link": "down"}
+    down = document(ports=[port])
+    reports.take(down)
+    nothing = document() | {"stations": [], "appliances": []}
+    assert reports.take(nothing, {"line": "gone"}) == ["error line: gone"]
+    assert reports.take(down) == ["info line: answers again after 1.0 s"]
 
 
 def test_fault_with_a_growing_number_is_one_fault(reports: Reports) -> None:
