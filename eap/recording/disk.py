@@ -111,5 +111,7 @@ class DiskThread:
                 if time_ns() >= flush_ns:
                     flush_ns = time_ns() + int(_FLUSH_S * 1e9)
                     self._files.flush()
-            except (OSError, EapError, ValueError) as exc:
+            except (OSError, EapError) as exc:
                 self.failure = self.failure or str(exc)
+            except Exception as exc:  # noqa: BLE001  without this thread nothing would be written
+                self.failure = self.failure or f"{type(exc).__name__}: {exc}"

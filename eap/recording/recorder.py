@@ -50,6 +50,8 @@ _SHORTEST_LOOK_NS = 2_000_000
 _ATTACH_NS = 500_000_000
 _CHECK_NS = 1_000_000_000
 _KEPT_EVENTS = 1000
+_CLOCK_STEP_NS = 1_000_000_000
+"""Step of the host's clock that begins another file."""
 
 
 class RecorderOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -134,6 +136,7 @@ class Attachment(Closeable):
         self.condition: ConditionWatch | None = None
         self._check_ns = 0
         try:
+            self._files = self._image_files()
             self.layouts = self._read_layouts()
             if options.kind == "frames":
                 self.frames = FrameCapture(self._folder.frames)
@@ -190,6 +193,10 @@ class Attachment(Closeable):
         if not is_due and not any(moved):
             return False
         self._check_ns = now_ns + _CHECK_NS
+        files = self._image_files()
+        if files == self._files:
+            return False  # reading the directories of all images takes a while
+        self._files = files
         layouts = self._read_layouts()
         before, self.layouts = self.layouts, layouts
         return layouts != before and self._facts(layouts) != self._facts(before)
@@ -218,6 +225,13 @@ class Attachment(Closeable):
                 self._stations.append(capture)
         if not self._stations:
             raise ImageError("the patterns select no variable of the plant as it is now")
+
+    def _image_files(self) -> list[int]:
+        """Return what tells the files of the images from those that replace them."""
+        try:
+            return [path.stat().st_ino for path in self._paths.values()]
+        except OSError as exc:
+            raise ImageError(f"a process image is missing: {exc}") from None
 
     def _read_layouts(self) -> list[ImageLayout]:
         layouts = []
@@ -248,7 +262,7 @@ class Recorder:
 
     def __init__(self, options: RecorderOptions, now_ns: int) -> None:
         self._options = options
-        offset_ns = unix_offset_ns()
+        self._offset_ns = offset_ns = unix_offset_ns()
         self.state = RecordingState(
             name=options.name,
             kind=options.kind,
@@ -292,6 +306,9 @@ class Recorder:
             return now_ns + (_LOOK_NS if self._attached is None else 0)
         offset_ns = unix_offset_ns()
         try:
+            if abs(offset_ns - self._offset_ns) > _CLOCK_STEP_NS:
+                self._set_clock(attached, now_ns, offset_ns)
+            self._offset_ns = offset_ns
             self._take(attached, now_ns, offset_ns)
             if attached.follow(now_ns):
                 self._change(attached, now_ns + offset_ns)
@@ -444,6 +461,17 @@ class Recorder:
         for block in blocks:
             self._write(block)
         self._write_events(first_ns)
+
+    def _set_clock(self, attached: Attachment, now_ns: int, offset_ns: int) -> None:
+        """Begin anew at another time: in one file, and in a ring, times only grow."""
+        self._take(attached, now_ns, self._offset_ns)
+        self._trigger.reset()
+        self._disk.close_file(now_ns + self._offset_ns)
+        self._change(attached, now_ns + offset_ns)
+        step_s = (offset_ns - self._offset_ns) / 1e9
+        text = f"the clock of this host was set by {step_s:+.3f} s"
+        event = RecordingEvent(time_ns=now_ns + offset_ns, kind=EventKind.MARK, text=text)
+        self._add_event(event)
 
     def _change(self, attached: Attachment, time_ns: int) -> None:
         """Begin another file: the stations were changed."""

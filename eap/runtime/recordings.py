@@ -19,7 +19,13 @@ import msgspec
 from eap.closeable import Closeable
 from eap.errors import EnvironmentalError
 from eap.quantities import count
-from eap.runtime.folder import ApplianceFolder, folder_name, runtime_root, runtime_roots
+from eap.runtime.folder import (
+    MAX_SOCKET_PATH,
+    ApplianceFolder,
+    folder_name,
+    runtime_root,
+    runtime_roots,
+)
 
 _FOLDER = ".recordings"
 _FLOCK = struct.Struct("hhqqi4x")
@@ -108,6 +114,12 @@ class RecordingFolder(Closeable):
                 f" 'eapctl record stop {name}'"
             ) from None
         folder = cls(path, lock_fd)
+        if len(os.fsencode(folder.control_socket)) > MAX_SOCKET_PATH:
+            folder.close()
+            raise EnvironmentalError(
+                f"{folder.control_socket} is too long for a socket's path (at most"
+                f" {MAX_SOCKET_PATH} bytes): choose a shorter name"
+            )
         for entry in path.iterdir():
             if entry.name != "lock":
                 entry.unlink()

@@ -11,9 +11,8 @@ from eap.expressions import Condition
 from eap.net.framering_file import FrameRingFile
 from eap.net.image_file import create_image, prepare_image
 from eap.pd.framering import SentFrame
-from eap.pd.image import Inputs, Sampler
 from eap.pd.layout import plan_layout
-from eap.pd.spec import VariableSpec, Writer
+from eap.pd.spec import VariableSpec
 from eap.pd.words import RxWord, StationWord
 from eap.recording.capture import (
     FrameCapture,
@@ -25,37 +24,15 @@ from eap.recording.capture import (
     samples_in,
 )
 from eap.recording.condition import ConditionWatch
+from tests.support.samplingengine import SamplingEngine
 from tests.unit.eap.conftest import left, right
 
 MS = 1_000_000
 
 
-class Engine:
-    """Runs cycles of a station without anything but a counter."""
-
-    def __init__(self, path, spec) -> None:
-        self.spec = spec
-        self.path = path
-        self.attach(create_image(path, plan_layout(spec)))
-
-    def attach(self, file) -> None:
-        self.file = file
-        self.image = file.image
-        self.sampler = Sampler(file.image, Inputs(file.image).memory)
-
-    def run(self, count=1) -> None:
-        for _ in range(count):
-            words = self.image.words
-            words[StationWord.CYCLE] += 1
-            cycle = words[StationWord.CYCLE]
-            with self.image.writing(Writer.ENGINE):
-                self.image.write("ticks", cycle % 65536)
-            self.sampler.end_cycle(cycle, cycle * 10 * MS)
-
-
 @pytest.fixture
 def engine(tmp_path):
-    made = Engine(tmp_path / "left.image", left())
+    made = SamplingEngine(tmp_path / "left.image", left())
     made.run(5)
     yield made
     made.file.close()

@@ -186,6 +186,13 @@ def test_disk_thread_reports_its_first_failure_and_ends_in_order(tmp_path):
     assert files.opened[0].messages == 0
 
 
+def test_disk_thread_reports_errors_of_any_kind(tmp_path):
+    disk = DiskThread(Files(tmp_path).sequence)
+    disk.open(lambda path, time_ns: 1 // (time_ns - time_ns), 0)
+    disk.end(0)
+    assert disk.failure.startswith("ZeroDivisionError")
+
+
 def test_blocks_that_the_disk_cannot_take_in_time_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("eap.recording.disk.QUEUE_BYTES", 10)
     files = Files(tmp_path)

@@ -56,6 +56,12 @@ def test_name_is_free_again_when_its_recording_is_over():
         assert find_recordings() == []
 
 
+def test_name_that_is_too_long_for_a_socket_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("EAP_RUNTIME_DIR", str(tmp_path / ("x" * 60)))
+    with pytest.raises(EnvironmentalError, match="too long for a socket's path"):
+        RecordingFolder.claim("y" * 60)
+
+
 def test_recordings_that_ended_long_ago_are_forgotten():
     for number in range(KEPT + 3):
         with RecordingFolder.claim(f"r{number}") as folder:
