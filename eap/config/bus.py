@@ -12,9 +12,10 @@ from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import ExpectedBus, Index
+from eap.config.plant_sections import PlantFile
 from eap.config.routes import SectionError
 from eap.config.slaves import check_cycles, override
-from eap.config.structs import Plain, PlantFile, PortSection, StationSection
+from eap.config.structs import Plain, PortSection, StationSection
 from eap.ids import InterfaceUri, is_host
 from eap.od.slave_config import SlaveConfig
 from eap.pd.spec import GatewayAddress, GatewaySpec, PortKind

@@ -23,7 +23,8 @@ import yaml
 from msgspec import inspect
 
 from eap.config.finding import FindingReport, one_of
-from eap.config.structs import INVALID_NET_ID, PlantFile, Section
+from eap.config.plant_sections import PlantFile
+from eap.config.structs import INVALID_NET_ID, Section
 from eap.ids import NET_ID, NetId
 from eap.suggest import nearest, suggest
 
@@ -407,15 +408,14 @@ class _Converter:
             message = f"unknown kind {tag!r}{suggest(tag, tags)}"
             self._report.add(f"{path}.kind", message, one_of(tags))
             raise _ReportedError
-        # The key of a source is the variable it fills.
-        values = {
-            **{name: entry for name, entry in node.value.items() if name != "kind"},
-            "variable": (node.line, ScalarNode(node.line, key, key, plain=False)),
-        }
-        if "variable" in node.value:
-            self._report.add(
-                path, "unknown key 'variable'", "the variable as the key of its source"
-            )
+        values = {name: entry for name, entry in node.value.items() if name != "kind"}
+        if any(field.name == "variable" for field in tags[tag].fields):
+            # The key of a source is the variable it fills.
+            values["variable"] = (node.line, ScalarNode(node.line, key, key, plain=False))
+            if "variable" in node.value:
+                self._report.add(
+                    path, "unknown key 'variable'", "the variable as the key of its source"
+                )
         return self._struct(Node(node.line, values), tags[tag], path, key)
 
     def _enter(self, node: Node, path: str) -> None:

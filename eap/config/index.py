@@ -21,10 +21,10 @@ from eap.codec import datatypes
 from eap.codec.datatypes import DataType
 from eap.codec.structures import find_variable
 from eap.config.finding import PlantFinding
+from eap.config.plant_sections import PlantFile
 from eap.config.structs import (
     FrameSection,
     FromSection,
-    PlantFile,
     PortSection,
     PublishSection,
     StationSection,

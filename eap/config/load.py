@@ -48,6 +48,7 @@ from eap.config.exchange import check_polls, check_publish, check_subscribe
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index, SentPd, VariablePart
 from eap.config.links import check_links, ends, execution_order, is_bitwise
+from eap.config.plant_sections import PlantFile
 from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
 from eap.config.routes import (
     check_routes,
@@ -63,7 +64,6 @@ from eap.config.structs import (
     AuditMode,
     FrameSection,
     FromSection,
-    PlantFile,
     PortSection,
     StationSection,
     SubscribeSection,
@@ -71,6 +71,8 @@ from eap.config.structs import (
 )
 from eap.config.types import TypeTable, resolve_types
 from eap.config.variables import check_variables
+from eap.config.web import check_web, resolved, warn_of_pictures
+from eap.config.web_sections import WebSection
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
 from eap.pd.address import address_text, net_id_of, source_octets
 from eap.pd.spec import (
@@ -473,6 +475,8 @@ class Plant(msgspec.Struct, frozen=True):
     """Names of the stations, ports and slaves of the plant."""
     audit_required: bool = False
     """True if changes that cannot be recorded are refused."""
+    web: WebSection | None = None
+    """Page for browsers, with resolved paths; None without one."""
 
 
 class PlantResult(msgspec.Struct, frozen=True):
@@ -512,6 +516,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
     check_routes(index, report, path.parent)
     check_discovery(index, report)
     check_access(index, report, path.parent)
+    check_web(index, report, path.parent)
     # Derived only from a plant without findings, so nothing below can fail.
     if findings := report.findings():
         return PlantResult(None, findings)
@@ -521,12 +526,15 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
         derive_routing(index, path.parent),
         derive_directory(index),
         audit_required=plant_file.access.audit is AuditMode.REQUIRED,
+        web=plant_file.web and resolved(plant_file.web, path.parent),
     )
     warnings = (
         *report.warnings,
         *follow_routes(index, plant.routing, report),
         *warn_of_open_brokers(index, report),
+        *warn_of_pictures(index, report, path.parent),
     )
+
     return PlantResult(plant, (), report.lines, warnings, types)
 
 

@@ -508,13 +508,3 @@ class PlantAccess(Section, frozen=True):
     """Rules for the access to all stations; each has rules of its own beside them."""
 
     audit: AuditMode = AuditMode.OPTIONAL
-
-
-class PlantFile(Section, frozen=True):
-    """The whole file; top-level keys that begin with ``x-`` are free for anchors."""
-
-    plant: str
-    stations: tuple[StationSection, ...]
-    defaults: Defaults = Defaults()
-    access: PlantAccess = PlantAccess()
-    types: dict[str, TypeSection] | tuple[str | dict[str, TypeSection], ...] = {}

@@ -26,7 +26,8 @@ from eap.codec.structures import (
     place_structure,
 )
 from eap.config.finding import FindingReport, PlantFinding
-from eap.config.structs import PlantFile, StationSection, TypeSection, VariableSection
+from eap.config.plant_sections import PlantFile
+from eap.config.structs import StationSection, TypeSection, VariableSection
 
 if TYPE_CHECKING:
     from eap.config.imports.typefile import ArrayBound, TypeRecord

@@ -1,0 +1,484 @@
+"""The key ``web`` of a plant file: checks, default pages, and the record that the server gets."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
+from ipaddress import ip_address, ip_network
+from pathlib import Path
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from eap.codec import datatypes
+from eap.codec.structures import variable_of
+from eap.config.brokers import check_file
+from eap.config.finding import FindingReport, PlantFinding, one_beside, one_of
+from eap.config.index import Index
+from eap.config.passwords import FORM, PasswordHash
+from eap.config.pictures import read_picture
+from eap.config.structs import StationSection
+from eap.config.web_sections import (
+    BindSection,
+    BusPanel,
+    EventsPanel,
+    GraphPanel,
+    Panel,
+    PicturePanel,
+    Role,
+    RoutesPanel,
+    SetPanel,
+    StatesPanel,
+    TablePanel,
+    TrendPanel,
+    ValuePanel,
+    WebPage,
+    WebSection,
+)
+from eap.ids import parse_host
+from eap.pd.rules import MADE_SUFFIXES
+from eap.pd.spec import PortKind
+from eap.suggest import suggest
+
+MAX_WINDOW_S = 24 * 3600
+MIN_WINDOW_S = 10
+MAX_TRENDS = 200
+"""Variables of all trends: the server keeps the last window of each."""
+MAX_PANELS = 200
+"""Panels of a page."""
+STATE = "state"
+"""State of a station as if it were one of its variables, unless it has one with this name."""
+
+_OF = "STATION/VARIABLE, with * for any text"
+_LISTEN = "ADDRESS:PORT, such as 127.0.0.1:8080 or [::1]:8080"
+_WINDOW = re.compile(r"(\d{1,6})(s|m|h)")
+_UNITS = {"s": 1, "m": 60, "h": 3600}
+_HEADER = re.compile(r"[A-Za-z0-9-]+")
+
+
+class Listen(NamedTuple):
+    """Address of the page's server."""
+
+    host: str
+    port: int
+
+    @property
+    def is_loopback(self) -> bool:
+        """True if only programs of this host reach it."""
+        return ip_address(self.host).is_loopback
+
+    @property
+    def is_any(self) -> bool:
+        """True for all addresses of this host."""
+        return ip_address(self.host).is_unspecified
+
+    def url(self, scheme: str) -> str:
+        """Return the address for a browser."""
+        host = "localhost" if self.is_any else self.host
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/"
+
+
+def parse_listen(text: str) -> Listen:
+    """Read ``ADDRESS:PORT``; raise ValueError if it is none."""
+    host, separator, number = text.rpartition(":")
+    if not separator or not number.isdecimal() or not 0 < int(number) < 65536:
+        raise ValueError(f"{text!r} is not an address with a port (1 to 65535)")
+    host = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    try:
+        return Listen(str(ip_address(host)), int(number))
+    except ValueError:
+        raise ValueError(f"{host!r} is not an IP address") from None
+
+
+def window_s(text: str) -> int:
+    """Return the seconds of a window such as ``10m``; raise ValueError if it is none."""
+    match = _WINDOW.fullmatch(text)
+    if match is None:
+        raise ValueError(f"{text!r} is not a time")
+    seconds = int(match[1]) * _UNITS[match[2]]
+    if not MIN_WINDOW_S <= seconds <= MAX_WINDOW_S:
+        raise ValueError(f"{text!r} is out of range")
+    return seconds
+
+
+def names_in(of: str | tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names and patterns of a panel's ``of``."""
+    return (of,) if isinstance(of, str) else of
+
+
+@cache
+def _compiled(pattern: str) -> re.Pattern[str]:
+    return re.compile("[^/]*".join(map(re.escape, pattern.split("*"))))
+
+
+def match_names(pattern: str, names: Iterable[str]) -> list[str]:
+    """Return the *names* that fit *pattern*; ``*`` stands for any text without slashes."""
+    if "*" not in pattern:
+        return [name for name in names if name == pattern]
+    expression = _compiled(pattern)
+    return [name for name in names if expression.fullmatch(name)]
+
+
+def trend_windows(pages: Iterable[WebPage]) -> dict[str, int]:
+    """Return the longest window of each pattern of the trends of *pages*, in seconds."""
+    found: dict[str, int] = {}
+    for page in pages:
+        for panel in page.panels:
+            if isinstance(panel, TrendPanel):
+                for name in names_in(panel.of):
+                    found[name] = max(found.get(name, 0), window_s(panel.window))
+    return found
+
+
+def default_pages(plant: str, stations: Iterable[str]) -> tuple[WebPage, ...]:
+    """Return pages for a plant without ``pages``: one of the plant, and one a station."""
+    overview = WebPage(
+        name=plant or "plant",
+        panels=(GraphPanel(), BusPanel(), EventsPanel()),
+    )
+    own = (
+        WebPage(
+            name=name,
+            panels=(
+                GraphPanel(of=name),
+                StatesPanel(of=f"{name}/{STATE}"),
+                TablePanel(of=f"{name}/*"),
+                BusPanel(of=f"{name}/*"),
+                RoutesPanel(of=name),
+                EventsPanel(of=name),
+            ),
+        )
+        for name in stations
+    )
+    return overview, *own
+
+
+def default_role(web: WebSection) -> Role | None:
+    """Return the role of browsers without a user; None if they have to log in.
+
+    Programs of this host may do everything by ADS, too, unless a rule denies it.
+    """
+    if web.anonymous is not None:
+        return web.anonymous
+    has_users = web.users or web.proxy is not None
+    return None if has_users else Role.ENGINEER
+
+
+def resolved(web: WebSection, folder: Path) -> WebSection:
+    """Return *web*, which has no findings, with the paths of its files from *folder* on."""
+
+    def panel(each: Panel) -> Panel:
+        if isinstance(each, PicturePanel):
+            return replace(each, file=str((folder / each.file).resolve()))
+        return each
+
+    tls = web.tls and replace(
+        web.tls,
+        certificate=str((folder / web.tls.certificate).resolve()),
+        key=str((folder / web.tls.key).resolve()),
+    )
+    pages = tuple(replace(page, panels=tuple(map(panel, page.panels))) for page in web.pages)
+    return replace(web, tls=tls, pages=pages)
+
+
+def check_web(index: Index, report: FindingReport, folder: Path) -> None:
+    """Report every invalid key of ``web``; files are in *folder*."""
+    if (web := index.plant.web) is None:
+        return
+    _check_listen(web, report)
+    _check_users(web, report)
+    _check_proxy(web, report)
+    for position, name in enumerate(web.hosts):
+        try:
+            parse_host(name.replace(":", " "), 80)
+        except ValueError:
+            report.add(f"{web.at}.hosts[{position}]", f"{name!r} is no name of a host", "a name")
+    if web.tls is not None:
+        check_file(f"{web.tls.at}.certificate", web.tls.certificate, report, folder)
+        check_file(f"{web.tls.at}.key", web.tls.key, report, folder)
+    names: dict[str, WebPage] = {}
+    for page in web.pages:
+        if not page.name.strip():
+            report.add(f"{page.at}.name", "the page has an empty name", "a text")
+        elif names.setdefault(page.name, page) is not page:
+            report.add(f"{page.at}.name", f"page {page.name!r} is there twice", "each name once")
+        if len(page.panels) > MAX_PANELS:
+            message = f"page {page.name!r} has {len(page.panels)} panels"
+            report.add(f"{page.at}.panels", message, f"at most {MAX_PANELS}")
+    _PanelCheck(index, report, folder).check(web)
+
+
+def warn_of_pictures(index: Index, report: FindingReport, folder: Path) -> list[PlantFinding]:
+    """Return a warning for each picture with elements that the page leaves out."""
+    web = index.plant.web
+    found = []
+    for page in web.pages if web else ():
+        for panel in page.panels:
+            if not isinstance(panel, PicturePanel):
+                continue
+            if left_out := read_picture(folder / panel.file).left_out:
+                message = f"{panel.file}: the page leaves out {', '.join(left_out)}"
+                expected = "shapes and texts whose looks are attributes"
+                line = report.line_of(f"{panel.at}.file")
+                found.append(PlantFinding(report.file, line, panel.at, message, expected))
+    return found
+
+
+def _check_listen(web: WebSection, report: FindingReport) -> None:
+    at = f"{web.at}.listen"
+    try:
+        listen = parse_listen(web.listen)
+    except ValueError as exc:
+        report.add(at, f"listen: {exc}", _LISTEN)
+        return
+    if listen.is_loopback:
+        return
+    # Without these the plant would be open to the network, and passwords would go in clear.
+    if not web.users and web.proxy is None:
+        message = f"listen: {web.listen} is reached by other hosts, and there are no users"
+        report.add(at, message, "users, or an address of this host alone (127.0.0.1)")
+    if web.tls is None:
+        message = f"listen: {web.listen} is reached by other hosts, and there is no tls"
+        report.add(at, message, "tls with certificate and key, or 127.0.0.1")
+    if web.anonymous not in {None, Role.VIEWER}:
+        message = f"anonymous: every host would be {web.anonymous} without a password"
+        report.add(f"{web.at}.anonymous", message, "viewer, or no such key")
+
+
+def _check_users(web: WebSection, report: FindingReport) -> None:
+    names: set[str] = set()
+    for user in web.users:
+        if not user.name.strip() or not user.name.isprintable() or ":" in user.name:
+            report.add(f"{user.at}.name", f"user {user.name!r}", "a name without colons")
+        if user.name in names:
+            report.add(f"{user.at}.name", f"user {user.name} is there twice", "each user once")
+        names.add(user.name)
+        if not user.password and web.proxy is not None:
+            continue
+        try:
+            PasswordHash.parse(user.password)
+        except ValueError as exc:
+            where = f"{user.at}.password" if user.password else user.at
+            report.add(where, f"user {user.name}: {exc}", FORM)
+
+
+def _check_proxy(web: WebSection, report: FindingReport) -> None:
+    if (proxy := web.proxy) is None:
+        return
+    if not _HEADER.fullmatch(proxy.header):
+        message = f"header {proxy.header!r} is no name of a header"
+        report.add(f"{proxy.at}.header", message, "a name such as X-Remote-User")
+    if not proxy.networks:
+        report.add(f"{proxy.at}.from", "from is empty", "the address of the proxy")
+    for position, text in enumerate(proxy.networks):
+        try:
+            ip_network(text, strict=False)
+        except ValueError:
+            message = f"{text!r} is no address and no network"
+            report.add(f"{proxy.at}.from[{position}]", message, "the address of the proxy")
+    if not web.users:
+        report.add(proxy.at, "a proxy without users", "users with their roles, without passwords")
+
+
+class _PanelCheck:
+    """Check of the panels of all pages against the names of the plant."""
+
+    def __init__(self, index: Index, report: FindingReport, folder: Path) -> None:
+        self._index = index
+        self._report = report
+        self._folder = folder
+        self._known = {
+            station.name: list(_names_of(index, station)) for station in index.plant.stations
+        }
+        self._names = [f"{name}/{each}" for name, own in self._known.items() for each in own]
+
+    def check(self, web: WebSection) -> None:
+        """Report every invalid panel."""
+        trends: set[str] = set()
+        for page in web.pages:
+            for panel in page.panels:
+                self._check_panel(panel)
+                if isinstance(panel, TrendPanel):
+                    trends.update(*(match_names(of, self._names) for of in names_in(panel.of)))
+        if len(trends) > MAX_TRENDS:
+            message = f"the trends show {len(trends)} variables"
+            self._report.add(f"{web.at}.pages", message, f"at most {MAX_TRENDS}")
+
+    def _check_panel(self, panel: Panel) -> None:
+        match panel:
+            case ValuePanel() | TablePanel():
+                self._check_variables(panel)
+            case StatesPanel():
+                self._check_variables(panel, [f"{name}/{STATE}" for name in self._known])
+            case TrendPanel():
+                self._check_variables(panel)
+                self._check_range(panel)
+                self._check_window(panel)
+            case SetPanel():
+                self._check_set(panel)
+            case PicturePanel():
+                self._check_picture(panel)
+            case BusPanel():
+                self._check_patterns(panel, "bus", self._buses(), "STATION/PORT")
+            case EventsPanel() | GraphPanel() | RoutesPanel():
+                self._check_patterns(panel, "station", self._known, "a station")
+
+    def _check_variables(
+        self,
+        panel: ValuePanel | TablePanel | StatesPanel | TrendPanel,
+        more: Sequence[str] = (),
+    ) -> None:
+        for path, name in _paths_of(panel.of, f"{panel.at}.of"):
+            if "*" not in name and name not in more:
+                self._find(path, name)
+            elif not match_names(name, [*self._names, *more]) and not self._may_be_on_bus(name):
+                self._report.add(path, f"no variable fits {name!r}", _OF)
+
+    def _find(self, path: str, name: str) -> tuple[StationSection, str] | None:
+        """Return station and variable that *name* is, after reporting that there is none."""
+        station_name, separator, variable = name.partition("/")
+        station = self._index.stations.get(station_name)
+        if not separator:
+            self._report.add(path, f"{name!r} names no variable", "STATION/VARIABLE")
+        elif station is None:
+            if station_name not in self._report.broken:
+                message = f"unknown station {station_name!r}{suggest(station_name, self._known)}"
+                self._report.add(path, message, one_of(self._known))
+        elif not self._has(station, variable):
+            known = self._known[station_name]
+            message = f"station {station_name} has no variable {variable!r}"
+            message += suggest(variable, known)
+            self._report.add(path, message, one_beside(variable, known))
+        else:
+            return station, variable
+        return None
+
+    def _has(self, station: StationSection, variable: str) -> bool:
+        if variable in self._known[station.name] or self._may_be_on_bus(
+            f"{station.name}/{variable}"
+        ):
+            return True
+        try:
+            return self._index.part(station, variable) is not None
+        except ValueError:
+            return variable.partition(".")[0].partition("[")[0] in self._report.broken
+
+    def _may_be_on_bus(self, name: str) -> bool:
+        """Return whether *name* is of a bus whose file could not be read."""
+        station_name, _, variable = name.partition("/")
+        station = self._index.stations.get(station_name)
+        if station is None:
+            return False
+        return any(variable.startswith(f"{p}.") for p in self._index.unread_buses(station))
+
+    def _check_patterns(
+        self,
+        panel: BusPanel | EventsPanel | GraphPanel | RoutesPanel,
+        noun: str,
+        known: Iterable[str],
+        expected: str,
+    ) -> None:
+        names = list(known)
+        is_default = panel.of in {"*", "*/*"}
+        for path, name in _paths_of(panel.of, f"{panel.at}.of"):
+            if not is_default and not match_names(name, names):
+                hint = "" if "*" in name else suggest(name, names)
+                message = f"unknown {noun} {name!r}{hint}"
+                self._report.add(path, message, one_of(names) if names else expected)
+
+    def _buses(self) -> list[str]:
+        return [
+            f"{station.name}/{port.name}"
+            for station in self._index.plant.stations
+            for port in station.ports
+            if port.kind is PortKind.BUS
+        ]
+
+    def _check_window(self, panel: TrendPanel) -> None:
+        try:
+            window_s(panel.window)
+        except ValueError as exc:
+            expected = "a time from 10s to 24h, such as 10m"
+            self._report.add(f"{panel.at}.window", f"window: {exc}", expected)
+
+    def _check_range(self, panel: TrendPanel | SetPanel | BindSection) -> None:
+        if panel.low is not None and panel.high is not None and panel.low >= panel.high:
+            message = f"min {panel.low:g} is not below max {panel.high:g}"
+            self._report.add(f"{panel.at}.min", message, "a smaller one")
+
+    def _check_set(self, panel: SetPanel) -> None:
+        self._check_range(panel)
+        if panel.role is Role.VIEWER:
+            self._report.add(f"{panel.at}.for", "viewers set nothing", "operator or engineer")
+        if panel.step is not None and panel.step <= 0:
+            self._report.add(f"{panel.at}.step", f"step is {panel.step:g}", "more than 0")
+        path = f"{panel.at}.of"
+        if (found := self._find(path, panel.of)) is None:
+            return
+        station, variable = found
+        if reason := _reason_not_settable(self._index, station, variable):
+            message = f"variable {panel.of} cannot be set: {reason}"
+            self._report.add(path, message, "a variable without source and link")
+        has_limits = panel.low is not None or panel.high is not None
+        if has_limits and not _is_number(self._index, station, variable):
+            key = "min" if panel.low is not None else "max"
+            message = f"variable {panel.of} is no number"
+            self._report.add(f"{panel.at}.{key}", message, "no limits")
+
+    def _check_picture(self, panel: PicturePanel) -> None:
+        try:
+            ids = read_picture(self._folder / panel.file).ids
+        except ValueError as exc:
+            expected = "an SVG picture, its path from the plant file on"
+            self._report.add(f"{panel.at}.file", f"{panel.file}: {exc}", expected)
+            ids = None
+        for selector, bound in panel.bind.items():
+            path = f"{panel.at}.bind.{selector}"
+            self._find(path, bound.of)
+            self._check_range(bound)
+            if not selector.startswith("#"):
+                self._report.add(path, f"{selector!r} is no element", "# and the id of an element")
+            elif ids is not None and selector[1:] not in ids:
+                message = f"{panel.file} has no element {selector!r}{suggest(selector[1:], ids)}"
+                self._report.add(path, message, one_of(sorted(ids)[:12]))
+
+
+def _names_of(index: Index, station: StationSection) -> Iterator[str]:
+    """Yield all variables of a station, also those that control its frames and PDs."""
+    yield from index.names(station)
+    for frame in station.frames:
+        yield f"{frame.name}{MADE_SUFFIXES[1]}"
+    for pd in station.publish:
+        yield f"{pd.name}{MADE_SUFFIXES[0]}"
+
+
+def _paths_of(of: str | tuple[str, ...], at: str) -> Iterator[tuple[str, str]]:
+    if isinstance(of, str):
+        yield at, of
+    else:
+        yield from ((f"{at}[{position}]", name) for position, name in enumerate(of))
+
+
+def _reason_not_settable(index: Index, station: StationSection, name: str) -> str:
+    names = index.names(station)
+    variable = variable_of(name, names)
+    if any(variable_of(each, names) == variable for each in station.sources):
+        return "it has a source"
+    if any(variable_of(each.target, names) == variable for each in station.links):
+        return "a link writes it"
+    if (on_bus := index.bus_variables(station).get(variable)) is not None:
+        return "" if on_bus.is_output else "it is an input of a bus"
+    is_received = variable in names and variable not in station.variables
+    return "it is received" if is_received else ""
+
+
+def _is_number(index: Index, station: StationSection, name: str) -> bool:
+    try:
+        part = index.part(station, name)
+    except ValueError:
+        return True  # a finding of its own
+    if part is None:
+        return True
+    kind = part.kind
+    return isinstance(kind, datatypes.Integer | datatypes.Real)
