@@ -39,7 +39,7 @@ pip() { .venv/bin/python -m pip $quiet --no-input "$@" || fail "pip failed; its 
 case $kind in
 run)
     echo "make: installing the appliance and the packages that it needs into .venv"
-    pip install --editable .
+    pip install --editable '.[web]'
     ;;
 dev)
     echo "make: installing the appliance, and the tools for tests and checks (about 200 MB), into .venv"

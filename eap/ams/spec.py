@@ -36,9 +36,13 @@ class TransportKind(StrEnum):
     MQTT = "mqtt"
     LOCAL = "local"
     """Programs of this appliance."""
+    WEB = "web"
+    """Browsers: they set variables, and send no packets."""
 
 
-IP_TRANSPORTS = frozenset((TransportKind.AMS_TCP, TransportKind.UDP, TransportKind.TCP))
+IP_TRANSPORTS = frozenset(
+    (TransportKind.AMS_TCP, TransportKind.UDP, TransportKind.TCP, TransportKind.WEB)
+)
 """Kinds of transports whose connections begin with an IPv4 address."""
 
 
@@ -159,7 +163,7 @@ class AccessRule(SpecStruct, frozen=True):
         macs: MAC addresses that frames come from on Ethernet; an address in one of the two fits.
         net_ids: Source NetIDs, by their first four, five or all six bytes; they prove nothing.
         transports: Names (``mqtt:line``) or kinds (``ams-tcp``, ``udp``, ``tcp``, ``ethernet``,
-            ``mqtt``, ``local``).
+            ``mqtt``, ``local``, ``web``).
         targets: Of the requests.
         services: Kinds of operations.
         objects: Of a dictionary; a rule that has some is about nothing else.

@@ -198,6 +198,7 @@ _COMMANDS = {
     "status": ("status:status", "Show errors, stations, ports, process data and processes."),
     "top": ("top:top", "Watch stations, process data, buses, routes and events live."),
     "types": ("types:types", "Show the data types of a plant file with their layout."),
+    "web": ("web:web", "Serve pages of a plant to browsers, with a JSON API."),
     "trace": ("network:trace", "Show the path to a device, and the hop that failed."),
 }
 """BusAddress of each command below ``eap.cli``, and its line in the help."""

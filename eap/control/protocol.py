@@ -111,11 +111,26 @@ class ReadParameters(Parameters, frozen=True):
     names: tuple[str, ...] = ()
 
 
+class WriteOrigin(Parameters, frozen=True):
+    """Author of a write that a program makes for a user, for access rules and audit.
+
+    Attributes:
+        user: Name of the user, empty for one without login.
+        host: Address of the user's browser.
+        comment: The user's reason.
+    """
+
+    user: str
+    host: str
+    comment: str = ""
+
+
 class WriteParameters(Parameters, frozen=True):
     """``write``: all values are checked before the first is written."""
 
     station: str
     values: dict[str, Plain]
+    origin: WriteOrigin | None = None
 
 
 class SubscribeParameters(Parameters, frozen=True):

@@ -206,10 +206,7 @@ def _of_appliance(appliance: ApplianceStatus, plant: str) -> Iterator[StatusFind
     segments = processes.pop("segments", {})
     processes |= {f"segment {name}": process for name, process in segments.items()}
     for name, process in processes.items():
-        if not process["pid"]:
-            yield _error(f"{plant} {name}", "not running", "it is being restarted")
-        elif step := process.get("step"):
-            yield _warning(f"{plant} {name}", f"starting: {step}")
+        yield from _of_process(f"{plant} {name}", process)
     if audit := appliance.audit:
         yield from _of_audit(f"{plant} audit", audit)
     for name, process in processes.items():
@@ -227,6 +224,15 @@ def _of_appliance(appliance: ApplianceStatus, plant: str) -> Iterator[StatusFind
         yield _warning(f"{plant} engine", f"no realtime: {', '.join(refused)}", advice)
     if counts := _counts(engine.get("bus_requests", {})):
         yield _info(f"{plant} engine", f"requests to buses: {counts}")
+
+
+def _of_process(where: str, process: Row) -> Iterator[StatusFinding]:
+    if fault := process.get("fault"):  # of an optional process
+        yield _warning(where, f"not running: {fault}")
+    elif not process["pid"]:
+        yield _error(where, "not running", "it is being restarted")
+    elif step := process.get("step"):
+        yield _warning(where, f"starting: {step}")
 
 
 def _of_audit(where: str, audit: Row) -> Iterator[StatusFinding]:

@@ -45,6 +45,8 @@ class ProcessInfo(msgspec.Struct):
     """Report of the process when it became ready."""
     step: str = ""
     """Step of its start-up; empty when it runs."""
+    fault: str = ""
+    """Reason that an optional process does not run."""
 
 
 class ApplianceInfo(msgspec.Struct):
@@ -61,6 +63,8 @@ class ApplianceInfo(msgspec.Struct):
     services: ProcessInfo = msgspec.field(default_factory=ProcessInfo)
     segments: dict[str, ProcessInfo] = {}
     """Simulated buses by ``STATION/PORT``."""
+    extras: dict[str, ProcessInfo] = {}
+    """Optional processes, such as ``web``."""
     audit_required: bool = False
     """True if changes that cannot be recorded fail."""
 

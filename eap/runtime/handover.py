@@ -13,6 +13,7 @@ from typing import Self
 import msgspec
 
 from eap.ams.spec import DirectoryStation, RoutingSpec
+from eap.config.web_sections import WebSection
 from eap.ids import decode_value, encode_value
 from eap.pd.device import DeviceState
 from eap.pd.spec import PortSpec, SpecRecord, StationSpec
@@ -158,6 +159,15 @@ class SegmentHandover(InheritedRecord, frozen=True):
     """This side of the pair with the engine for the second line of a ring."""
     realtime: bool = False
     """As in EngineOptions."""
+
+
+class WebHandover(InheritedRecord, frozen=True):
+    """All that the process of the page gets."""
+
+    supervisor: int
+    """Process id, as in Handover."""
+    plant: str
+    web: WebSection
 
 
 class EngineOptions(SpecRecord, frozen=True):

@@ -68,7 +68,12 @@ from eap.services.routing.route_rows import (
     route_findings,
 )
 from eap.services.routing.station_router import StationRouter
-from eap.services.routing.station_routes import StationRoutes, access_of, make_router
+from eap.services.routing.station_routes import (
+    StationRoutes,
+    access_of,
+    denial_of_write,
+    make_router,
+)
 from eap.services.routing.station_routing import StationRouting
 from eap.services.sockets import Network, open_transports
 from eap.services.supervisor_link import SupervisorLink
@@ -363,6 +368,7 @@ class Services:
             images,
             status=SharedAnswer(status).get,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
+            deny_write=lambda station, origin: denial_of_write(devices.routers[station], origin),
             more=self._more_methods(devices)
             | GatewayMethods(self._handover, buses.gateways).table(),
         )

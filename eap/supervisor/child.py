@@ -27,7 +27,7 @@ from typing import Any
 
 import msgspec
 
-from eap.runtime.handover import Handover, SegmentHandover
+from eap.runtime.handover import InheritedRecord
 from eap.runtime.startup import Report
 
 FIRST_LIMIT_NS = 20_000_000_000
@@ -225,6 +225,8 @@ class Child:
         self.name = name
         self._bytecode = bytecode
         self.restarts = 0
+        self.fault = ""
+        """Reason that an optional process does not run, for ``status``."""
         self.is_ready = False
         self.report: dict[str, Any] = {}
         self.started_ns = 0
@@ -244,9 +246,7 @@ class Child:
         """Process id, 0 when there is no process."""
         return self._process.pid if self._process else 0
 
-    def start(
-        self, handover: Handover | SegmentHandover, descriptors: Iterable[int], now_ns: int
-    ) -> None:
+    def start(self, handover: InheritedRecord, descriptors: Iterable[int], now_ns: int) -> None:
         """Start the process; *descriptors* are those that *handover* speaks of."""
         with ExitStack() as theirs:
             self.report_fd, report_end = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)

@@ -12,6 +12,7 @@ import select
 import signal
 from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic_ns
 
@@ -36,7 +37,9 @@ from eap.runtime.handover import (
     BusSocket,
     EngineOptions,
     Handover,
+    InheritedRecord,
     SegmentHandover,
+    WebHandover,
 )
 from eap.runtime.plantfile import load_plant, require_own_buses
 from eap.runtime.startup import catch_end_signals
@@ -52,6 +55,10 @@ from eap.supervisor.sockets import (
 
 GRACE_NS = 1_000_000_000
 """Time for a process to end after SIGTERM; the whole appliance has two seconds."""
+_EXTRA_PAUSE_NS = 500_000_000
+"""Shortest pause before an optional process is started again."""
+_EXTRAS = {"web": ("aiohttp", "web")}
+"""Of each optional process: the module that it needs, and the extra that installs it."""
 SEGMENT_GRACE_NS = 500_000_000
 """The same for simulated segments, which end after the others."""
 
@@ -188,6 +195,8 @@ class Supervisor:
         self._services = Child("services", "eap.services.process", self._bytecode)
         self._segments: dict[BusSocket, Child] = {}
         """Of simulated buses, by key."""
+        self._extras: dict[Child, InheritedRecord] = {}
+        """Optional processes; the plant runs without them."""
         self._leaving: dict[Child, int] = {}
         """Segments of buses that were closed, and when they are killed."""
         self._restart_ns: dict[Child, int] = {}
@@ -207,6 +216,9 @@ class Supervisor:
             directory=plant.directory,
             audit_required=plant.audit_required,
         )
+        if plant.web is not None:
+            handover = WebHandover(os.getpid(), info.plant, plant.web)
+            self._extras[Child("web", "eap.web.process", self._bytecode)] = handover
         self._sockets = sockets
         self._common = common
         self._given = {
@@ -222,7 +234,11 @@ class Supervisor:
 
     @property
     def _children(self) -> tuple[Child, ...]:
-        return (*self._segments.values(), self._engine, self._services, *self._leaving)
+        return (*self._needed, *self._extras, *self._leaving)
+
+    @property
+    def _needed(self) -> tuple[Child, ...]:
+        return (*self._segments.values(), self._engine, self._services)
 
     def run(self) -> int:
         """Return the exit code when everything has ended."""
@@ -362,6 +378,7 @@ class Supervisor:
 
     def _is_ready(self, child: Child) -> None:
         child.watch.succeed()
+        child.fault = ""
         for each in self._children:
             each.watch.release(child.name, self._clock())
         self._follow_buses()  # a request may wait for this segment
@@ -369,9 +386,12 @@ class Supervisor:
         if child.restarts:
             took_ms = (self._clock() - child.started_ns) // 1_000_000
             logger.warning("%s runs again (process %d, %d ms)", child.name, child.pid, took_ms)
-        if not self._announced and all(child.is_ready for child in self._children):
+        if not self._announced and all(child.is_ready for child in self._needed):
             # Once: restarts later are no news for a script that waits for the start.
             self._announced = True
+            # Later than the plant, whose start they would delay; and not here, where a descriptor
+            # of theirs may be equal to one that has fired.
+            self._restart_ns |= dict.fromkeys(self._extras, self._clock())
             line = msgspec.json.encode({"ready": True, "stations": self._info.stations})
             try:
                 os.write(1, line + b"\n")
@@ -380,9 +400,16 @@ class Supervisor:
 
     def _handle_exit(self, child: Child) -> None:
         lived_ns = self._clock() - child.started_ns
+        last_step = child.watch.step
         code, last_line = child.reap()
         if self._leaving.pop(child, None) is not None:
             self._write_info()
+            return
+        if child in self._extras:
+            # A reason that the process knows is its last step: a line for each try would fill the
+            # log.
+            known = last_step if code == 2 else last_line
+            self._restart_extra(child, describe_end(code) if code <= 0 else known, lived_ns)
             return
         never_ran = not child.watch.has_run and not child.watch.is_stuck
         if never_ran and self._refuse_bus(child, last_line.removeprefix("segment: ")):
@@ -411,7 +438,38 @@ class Supervisor:
         else:
             self._start_again(child)
 
+    def _start_extra(self, child: Child) -> None:
+        self._restart_ns.pop(child, None)
+        module, extra = _EXTRAS[child.name]
+        if find_spec(module) is None:
+            # Only another installation changes this: without a restart it is not tried again.
+            child.fault = f"{module} is not installed: pip install 'eap-appliance[{extra}]'"
+            logger.warning("%s does not run: %s", child.name, child.fault)
+            self._write_info()
+            return
+        try:
+            child.start(self._extras[child], (), self._clock())
+        except OSError as exc:
+            child.close()
+            self._restart_extra(child, f"it cannot be started: {exc}", 0)
+        self._write_info()
+
+    def _restart_extra(self, child: Child, reason: str, lived_ns: int) -> None:
+        """Start an optional process again after a pause, however often it fails."""
+        child.restarts += 1
+        delay_ns = max(child.policy.delay_ns(lived_ns), _EXTRA_PAUSE_NS)
+        self._restart_ns[child] = self._clock() + delay_ns
+        reason = reason.removeprefix(f"{child.name}: ")
+        if reason != child.fault:  # the same one, again and again, would fill the log
+            pause_ms = delay_ns // 1_000_000
+            logger.warning("%s ended: %s; starting it again in %d ms", child.name, reason, pause_ms)
+        child.fault = reason
+        self._write_info()
+
     def _start_again(self, child: Child) -> None:
+        if child in self._extras:
+            self._start_extra(child)
+            return
         for bus in self._sockets.buses:
             if self._segments.get(bus.key) is child:
                 self._start_segment(bus, child)
@@ -450,7 +508,7 @@ class Supervisor:
 
     def _end_children(self) -> None:
         """End all: segments last, for the engine brings their slaves to rest."""
-        self._end((self._engine, self._services), GRACE_NS)
+        self._end((*self._extras, self._engine, self._services), GRACE_NS)
         self._end((*self._segments.values(), *self._leaving), SEGMENT_GRACE_NS)
 
     def _end(self, children: Collection[Child], grace_ns: int) -> None:
@@ -477,6 +535,7 @@ class Supervisor:
     def _write_info(self) -> None:
         self._info.engine = _process_info(self._engine)
         self._info.services = _process_info(self._services)
+        self._info.extras = {child.name: _process_info(child) for child in self._extras}
         self._info.segments = {
             _label(key): _process_info(child) for key, child in self._segments.items()
         }
@@ -502,7 +561,7 @@ def make_info(plant: str, plant_file: str, stations: Sequence[StationSpec]) -> A
 
 
 def _process_info(child: Child) -> ProcessInfo:
-    return ProcessInfo(child.pid, child.restarts, child.report, child.watch.step)
+    return ProcessInfo(child.pid, child.restarts, child.report, child.watch.step, child.fault)
 
 
 def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:

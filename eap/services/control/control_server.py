@@ -100,10 +100,15 @@ def change_of(
     if request.method not in _CHANGES or (request.method == "bus_transfer" and _are_reads(params)):
         return None
     described = {key: _shortened(value) for key, value in params.items() if key not in _HIDDEN}
+    described.pop("origin", None)
+    origin = params.get("origin")
+    author = {}
+    if isinstance(origin, dict):
+        author = {key: _shortened(origin.get(key, "")) for key in ("user", "host", "comment")}
     station = str(
         described.pop("station", "") or str(described.get("target", "")).partition("/")[0]
     )
-    return station, {"operation": request.method, "asked": described}
+    return station, {"operation": request.method, "asked": described} | author
 
 
 def error_in_result(result: Any, conversation: BusOpenParameters | None = None) -> str:

@@ -39,6 +39,8 @@ class Methods:
         images: The process image of each station.
         status: Makes the answer to ``status``.
         stop: Asks the appliance to end.
+        deny_write: Returns the reason that a user of the page may not write variables of a
+            station, empty if it may.
         more: Other methods by name.
     """
 
@@ -49,12 +51,14 @@ class Methods:
         *,
         status: Callable[[], Awaitable[dict[str, Any]]],
         stop: Callable[[], None],
+        deny_write: Callable[[str, control.WriteOrigin], str] = lambda *_: "",
         more: Mapping[str, Callable[[dict[str, Any]], Any]] | None = None,
     ) -> None:
         self._identity = identity
         self._images = images
         self._status = status
         self._stop = stop
+        self._deny_write = deny_write
         self._methods: dict[str, Callable[[dict[str, Any]], Any]] = {
             "status": self._get_status,
             **dict(
@@ -120,6 +124,8 @@ class Methods:
     def _write(self, wanted: control.WriteParameters) -> control.Written:
         station = self._station(wanted.station)
         slots = _slots_of(station.image, wanted.values)
+        if wanted.origin is not None and (why := self._deny_write(wanted.station, wanted.origin)):
+            raise ControlError(f"station {wanted.station}: {why}", code=ErrorCode.REFUSED)
         values = {slot.name: _checked(slot, wanted.values[slot.name]) for slot in slots}
         try:
             station.write_once(Writer.APPLICATION, values)

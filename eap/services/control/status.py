@@ -149,6 +149,10 @@ def appliance_status(
         "engine": engine,
         "services": _process(info.services, meter, now_ns),
     }
+    for name, process in info.extras.items():
+        processes[name] = _process(process, meter, now_ns) | process.report
+        if process.fault:
+            processes[name]["fault"] = process.fault
     if info.segments:
         processes["segments"] = {
             name: _process(process, meter, now_ns) for name, process in info.segments.items()

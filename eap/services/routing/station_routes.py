@@ -16,11 +16,14 @@ from ipaddress import IPv4Address
 
 from msgspec.structs import replace
 
+from eap.ads.request import Write
 from eap.ams.access import AccessList
 from eap.ams.routes import Origin, Route
 from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
-from eap.codec.ams import AMS_TCP_PORT
+from eap.codec.ads import IndexGroup
+from eap.codec.ams import AMS_TCP_PORT, IO_PORT
 from eap.codec.ethercat import EAP_PORT
+from eap.control.protocol import WriteOrigin
 from eap.errors import ControlError
 from eap.ids import STATION_OCTETS, Destination, DestinationKind, Endpoint, NetId, prefix_text
 from eap.net.interface import own_addresses
@@ -96,6 +99,19 @@ def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
         if spec.is_unidirectional
     )
     return AccessList((*closed, *routing.access), own=tuple(_own_addresses(station)))
+
+
+def denial_of_write(router: StationRouter, origin: WriteOrigin) -> str:
+    """Return the rule that denies a user of the page to write variables, empty if none does.
+
+    The page has checked the user's role.  So without a rule it may write, also from another host,
+    whose programs may not: they have no user.
+    """
+    # A browser has no NetID, and its address no port that would tell anything.
+    endpoint = Endpoint(TransportKind.WEB, origin.host)
+    grants = router.access.grants(endpoint, NetId(b""), router.net_id, IO_PORT)
+    decision = grants.decide(Write(IndexGroup.VALUE_BY_HANDLE, 0, b""))
+    return decision.why if decision.is_by_rule and not decision.is_allowed else ""
 
 
 def mqtt_transport_name(spec: MqttSpec) -> str:

@@ -1,0 +1,307 @@
+"""Decisions on each request before it is answered: host, rate, user, origin.
+
+A page of another site may send requests from a browser of this network.  The rules against that:
+the Host header is an address or a known name (DNS rebinding), a request with an Origin has that of
+this server, and a change that comes from a browser carries the token that only this server's own
+pages can read.  No answer allows another origin to read it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import hmac
+import json
+import logging
+import os
+import re
+from base64 import b64decode
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable
+from ipaddress import ip_address, ip_network
+from secrets import token_hex
+from time import monotonic, time
+from typing import Final, TypeAlias
+
+from aiohttp import web
+
+from eap.config.passwords import MAX_PASSWORD, PasswordHash
+from eap.config.web import default_role
+from eap.config.web_sections import WebSection
+from eap.net.limits import RateLimiter
+from eap.web.sessions import SESSION_S, LoginGuard, Principal, Sessions
+
+Handler: TypeAlias = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+COOKIE = "eap-session"
+CSRF_HEADER = "X-CSRF-Token"
+MAX_BODY = 64 << 10
+BODY_S = 10.0
+"""Time for the body of a request."""
+_RATE = 200, 50.0
+"""Requests of a host at once, and each second in the long run."""
+_MAX_HOSTS = 1024
+_MAX_HASHING = 8
+"""Logins that wait for their password to be hashed."""
+_REMEMBERED_S = 300.0
+_MAX_REMEMBERED = 256
+_SAFE = frozenset(("GET", "HEAD"))
+_NAME = re.compile(r"[a-z0-9-]+(\.[a-z0-9-]+)*\.?")
+
+HEADERS: Final = {
+    "Server": "eap",
+    "Content-Security-Policy": (
+        "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none';"
+        " form-action 'self'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+}
+USER: Final[web.RequestKey[Principal | None]] = web.RequestKey("user")
+"""User of a request; None if it has to log in."""
+TOKEN: Final = web.RequestKey("token", str)
+"""Its session, empty without one."""
+
+logger = logging.getLogger(__name__)
+
+
+def refusal(status: int, message: str, **headers: str) -> web.Response:
+    """Return the answer to a request that is refused, ``{"error": {"message"}}``."""
+    body = json.dumps({"error": {"message": message}}, ensure_ascii=False)
+    return web.Response(
+        status=status, text=body, content_type="application/json", headers=headers or None
+    )
+
+
+class Guard:
+    """Checks of requests and logins.
+
+    Args:
+        section: The key ``web``.
+        sessions: Sessions of its users.
+    """
+
+    def __init__(self, section: WebSection, sessions: Sessions) -> None:
+        self.sessions = sessions
+        self.has_logins = any(user.password for user in section.users)
+        self.is_secure = section.tls is not None
+        self._users = {user.name: user for user in section.users}
+        role = default_role(section)
+        self._anonymous = None if role is None else Principal("", role)
+        self._hosts = {name.lower().rstrip(".") for name in ("localhost", *section.hosts)}
+        self._hosts.add(os.uname().nodename.lower())
+        self._proxy = section.proxy
+        self._proxies = [
+            ip_network(text, strict=False)
+            for text in (section.proxy.networks if section.proxy else ())
+        ]
+        self._logins = LoginGuard()
+        self._rates: OrderedDict[str, RateLimiter] = OrderedDict()
+        self._hashing = asyncio.Semaphore(1)
+        self._waiting = 0
+        self._remembered: OrderedDict[bytes, tuple[str, float]] = OrderedDict()
+        # One that no password has: an unknown user takes as long as a wrong password.
+        self._nobody = PasswordHash(1 << 15, 8, 1, os.urandom(16), bytes(32))
+
+    @web.middleware
+    async def check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Answer a request that passes (middleware of the whole application)."""
+        answer: web.StreamResponse
+        try:
+            answer = (
+                self._refuse(request) or await self._identify(request) or await handler(request)
+            )
+        except web.HTTPException as exc:
+            # Those of aiohttp: no such path or method, a body that is too long.
+            answer = refusal(exc.status, exc.reason)
+            if "Allow" in exc.headers:
+                answer.headers["Allow"] = exc.headers["Allow"]
+        if not answer.prepared:
+            for name, value in HEADERS.items():
+                answer.headers.setdefault(name, value)
+            answer.headers.setdefault("Cache-Control", "no-store")
+            if self.is_secure:
+                answer.headers["Strict-Transport-Security"] = "max-age=31536000"
+        return answer
+
+    def host_of(self, request: web.Request) -> str:
+        """Return the address of the client, also behind the proxy."""
+        forwarded = request.headers.get("X-Forwarded-For", "").rpartition(",")[2].strip()
+        if forwarded and self._is_proxy(request):
+            return forwarded[:64]
+        return request.remote or ""
+
+    def refuse_foreign(self, request: web.Request) -> web.Response | None:
+        """Return the refusal of a request that a page of another site sent, None for others."""
+        origin = request.headers.get("Origin")
+        if origin is not None:
+            # Without the scheme: before a proxy with TLS it is another one.
+            if origin.partition("://")[2].lower() != request.host.lower():
+                return refusal(403, f"origin {origin[:100]} is another site")
+        elif request.headers.get("Sec-Fetch-Site", "same-origin") not in {"same-origin", "none"}:
+            return refusal(403, "the request comes from another site")
+        return None
+
+    def refuse_change(self, request: web.Request) -> web.Response | None:
+        """Return the refusal of a change that is forged, or may be, None for others."""
+        if (answer := self.refuse_foreign(request)) is not None:
+            return answer
+        if request.content_type != "application/json":
+            return refusal(415, "expected Content-Type: application/json")
+        is_browser = "Origin" in request.headers or "Sec-Fetch-Site" in request.headers
+        if is_browser or request.get(TOKEN):
+            given = request.headers.get(CSRF_HEADER, "").encode("utf-8", "replace")
+            if not hmac.compare_digest(given, self.csrf(request).encode()):
+                return refusal(403, f"header {CSRF_HEADER} is missing or old: reload the page")
+        return None
+
+    def csrf(self, request: web.Request) -> str:
+        """Return the token that changes of this session need."""
+        return self.sessions.csrf(request.get(TOKEN, ""))
+
+    async def login(self, user: str, password: str, host: str) -> str | web.Response:
+        """Return the token of a new session, or the refusal of a login."""
+        answer = await self._verify(user, password, host)
+        return answer or self.sessions.begin(user, token_hex(16), time())
+
+    def set_cookie(self, response: web.Response, token: str) -> None:
+        """Give a browser its session; an empty *token* takes it away."""
+        max_age = SESSION_S if token else 0
+        response.set_cookie(
+            COOKIE,
+            token,
+            max_age=max_age,
+            path="/",
+            httponly=True,
+            samesite="Strict",
+            secure=self.is_secure,
+        )
+
+    def _refuse(self, request: web.Request) -> web.Response | None:
+        if not self._is_known_host(request.host):
+            name = request.host[:100]
+            return refusal(403, f"host {name!r} is unknown here: add it to hosts of the key web")
+        if not self._take_rate(request.remote or ""):
+            return refusal(429, "too many requests", **{"Retry-After": "1"})
+        return None
+
+    def _is_known_host(self, text: str) -> bool:
+        """Return whether a Host header is right; an address cannot be rebound to another one."""
+        host = text.lower()
+        is_ipv6 = host.startswith("[")
+        host = host[1:].partition("]")[0] if is_ipv6 else host.partition(":")[0]
+        try:
+            ip_address(host)
+        except ValueError:
+            return _NAME.fullmatch(host) is not None and host.rstrip(".") in self._hosts
+        return True
+
+    def _take_rate(self, host: str) -> bool:
+        now_s = monotonic()
+        limiter = self._rates.get(host)
+        if limiter is None:
+            limiter = self._rates[host] = RateLimiter(*_RATE, now_s)
+            if len(self._rates) > _MAX_HOSTS:
+                self._rates.popitem(last=False)
+        self._rates.move_to_end(host)
+        return limiter.take(now_s)
+
+    async def _identify(self, request: web.Request) -> web.Response | None:
+        """Find the user of a request; return the refusal of wrong credentials."""
+        request[USER] = self._anonymous
+        request[TOKEN] = ""
+        if self._proxy is not None and (name := request.headers.get(self._proxy.header)):
+            return self._identify_by_proxy(request, name)
+        if token := request.cookies.get(COOKIE, ""):
+            found = self.sessions.find(token, time())
+            if found is not None:
+                request[USER], request[TOKEN] = found, token
+        elif given := request.headers.get("Authorization"):
+            return await self._identify_by_password(request, given)
+        return None
+
+    def _identify_by_proxy(self, request: web.Request, name: str) -> web.Response | None:
+        if not self._is_proxy(request):
+            return refusal(403, f"a user in a header is not taken from {request.remote}")
+        user = self._users.get(name)
+        if user is None:
+            return refusal(403, f"unknown user {name[:100]!r}: add it to users of the key web")
+        request[USER] = Principal(user.name, user.role)
+        return None
+
+    def _is_proxy(self, request: web.Request) -> bool:
+        if not self._proxies or not request.remote:
+            return False
+        remote = ip_address(request.remote)
+        return any(remote in each for each in self._proxies)
+
+    async def _identify_by_password(self, request: web.Request, given: str) -> web.Response | None:
+        scheme, _, encoded = given.partition(" ")
+        try:
+            login, separator, password = b64decode(encoded, validate=True).decode().partition(":")
+        except ValueError:
+            separator = ""
+        if scheme.lower() != "basic" or not separator:
+            return refusal(401, "expected Authorization: Basic")
+        digest = hashlib.sha256(given.encode("utf-8", "replace")).digest()
+        name, until_s = self._remembered.get(digest, ("", 0.0))
+        if until_s < monotonic():
+            refused = await self._verify(login, password, request.remote or "")
+            if refused is not None:
+                return refused
+            name = login
+            self._remembered[digest] = name, monotonic() + _REMEMBERED_S
+            if len(self._remembered) > _MAX_REMEMBERED:
+                self._remembered.popitem(last=False)
+        request[USER] = Principal(name, self._users[name].role)
+        return None
+
+    async def _verify(self, user: str, password: str, host: str) -> web.Response | None:
+        """Return None if a password is right, else the refusal."""
+        now_s = monotonic()
+        if locked_s := self._logins.locked_s(user, host, now_s):
+            wait = f"{locked_s:.0f}"
+            message = f"too many wrong passwords: wait {wait} s"
+            return refusal(429, message, **{"Retry-After": wait})
+        if self._waiting >= _MAX_HASHING:
+            return refusal(503, "too many logins at once", **{"Retry-After": "2"})
+        known = self._users.get(user)
+        stored = PasswordHash.parse(known.password) if known and known.password else self._nobody
+        self._waiting += 1
+        try:
+            # One at a time: each takes 32 MB and a tenth of a second of a core.
+            async with self._hashing:
+                is_right = await asyncio.to_thread(stored.matches, password)
+        finally:
+            self._waiting -= 1
+        if is_right and len(password.encode()) <= MAX_PASSWORD:
+            self._logins.succeed(user, host)
+            return None
+        number = self._logins.fail(user, host, monotonic())
+        logger.warning("login of %r from %s refused (%d wrong passwords)", user[:40], host, number)
+        return refusal(401, "unknown user or wrong password")
+
+
+def needs_user(request: web.Request) -> Principal:
+    """Return the user of a request; raise HTTPUnauthorized if it has to log in."""
+    user = request[USER]
+    if user is None:
+        raise web.HTTPUnauthorized(reason="log in first")
+    return user
+
+
+async def read_json(request: web.Request) -> object:
+    """Return the body of a request; raise HTTPBadRequest if it is not JSON."""
+    try:
+        async with asyncio.timeout(BODY_S):
+            body = await request.read()
+    except TimeoutError:
+        raise web.HTTPRequestTimeout(reason="the body did not come in time") from None
+    try:
+        return json.loads(body)
+    except (ValueError, RecursionError):
+        raise web.HTTPBadRequest(reason="the body is not JSON") from None

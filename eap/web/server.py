@@ -1,0 +1,228 @@
+"""The page's server: static files, API, WebSockets, and the policy of its connections."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import ssl
+from collections import Counter
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+
+from aiohttp import web
+
+from eap.config.web import parse_listen
+from eap.config.web_sections import WebSection
+from eap.errors import EnvironmentalError
+from eap.live.view import LiveView
+from eap.web.api import API, Api
+from eap.web.feed import PlantFeed
+from eap.web.guard import MAX_BODY, Guard
+from eap.web.sessions import Sessions
+from eap.web.sockets import Sockets
+from eap.web.topics import Topics
+
+STATIC = Path(__file__).parent / "static"
+MAX_CONNECTIONS = 512
+MAX_PER_HOST = 256
+HANDSHAKE_S = 10.0
+"""Time for the TLS handshake of a connection."""
+SLOW_READER_S = 20.0
+_KEEPALIVE_S = 20.0
+_TYPES = {
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+    ".png": "image/png",
+    ".json": "application/json",
+    ".txt": "text/plain",
+    ".woff2": "font/woff2",
+    ".webmanifest": "application/manifest+json",
+}
+
+logger = logging.getLogger(__name__)
+
+
+class PageServer:
+    """Page and API of one plant.
+
+    Args:
+        section: The key ``web``.
+        view: The appliances.
+        key: Secret for sessions, 32 bytes.
+    """
+
+    def __init__(self, section: WebSection, view: LiveView, key: bytes) -> None:
+        self._section = section
+        users = {user.name: user for user in section.users}
+        self.guard = Guard(section, Sessions(key, users))
+        self.feed = PlantFeed(view, on_status=self._status_changed)
+        self.topics = Topics(self.feed)
+        self.sockets = Sockets(self.feed, self.topics, self.guard)
+        self.api = Api(section, self.feed, self.topics, self.guard, self.sockets.end_session)
+
+    def application(self) -> web.Application:
+        """Return the application, whose tasks run as long as it does."""
+        app = web.Application(middlewares=[self.guard.check], client_max_size=MAX_BODY)
+        app.router.add_get(f"{API}/ws", self.sockets.serve)
+        app.router.add_routes(self.api.routes())
+        app.router.add_get("/", partial(_static, "index.html"))
+        for name in sorted(each.name for each in STATIC.iterdir() if each.suffix in _TYPES):
+            app.router.add_get(f"/{name}", partial(_static, name))
+        app.cleanup_ctx.append(self._run)
+        return app
+
+    def _status_changed(self) -> None:
+        self.api.update_pages()
+        self.topics.status_changed()
+
+    async def _run(self, app: web.Application) -> AsyncIterator[None]:
+        """Follow the plant while the application runs."""
+        del app
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(self.feed.run()), group.create_task(self.topics.run())]
+            yield
+            await self.sockets.close_all()
+            for task in tasks:
+                task.cancel()
+
+
+async def _static(name: str, request: web.Request) -> web.Response:
+    """Return a file of the page; the routes name all of them, so no path is made of a request."""
+    path = STATIC / name
+    stat = path.stat()
+    tag = f'"{stat.st_mtime_ns:x}-{stat.st_size:x}"'
+    headers = {"ETag": tag, "Cache-Control": "no-cache"}
+    if request.headers.get("If-None-Match") == tag:
+        return web.Response(status=304, headers=headers)
+    kind = _TYPES[path.suffix]
+    body = await asyncio.to_thread(path.read_bytes)
+    charset = "utf-8" if kind.startswith("text/") else None
+    return web.Response(body=body, content_type=kind, charset=charset, headers=headers)
+
+
+def open_listener(section: WebSection) -> socket.socket:
+    """Return the listening socket of the key ``web``.
+
+    Raises:
+        EnvironmentalError: it cannot be opened.
+    """
+    listen = parse_listen(section.listen)
+    family = socket.AF_INET6 if ":" in listen.host else socket.AF_INET
+    try:
+        listener = socket.socket(family, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(tuple(listen))
+        listener.listen(128)
+    except OSError as exc:
+        reason = f"web: cannot listen on {section.listen}: {exc.strerror}"
+        raise EnvironmentalError(f"{reason}; free it, or change listen of the key web") from None
+    listener.setblocking(False)
+    return listener
+
+
+def tls_context(section: WebSection) -> ssl.SSLContext | None:
+    """Return the TLS settings, None without TLS.
+
+    Raises:
+        EnvironmentalError: certificate or key cannot be used.
+    """
+    if section.tls is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(section.tls.certificate, section.tls.key, password=lambda: b"")
+    except (OSError, ssl.SSLError) as exc:
+        reason = exc.strerror or exc
+        raise EnvironmentalError(f"web: tls: {section.tls.certificate}: {reason}") from None
+    return context
+
+
+@asynccontextmanager
+async def serving(
+    server: PageServer, listener: socket.socket, context: ssl.SSLContext | None
+) -> AsyncIterator[None]:
+    """Serve connections of *listener* for the length of a block."""
+    runner = web.AppRunner(
+        server.application(),
+        access_log=None,
+        handle_signals=False,
+        keepalive_timeout=_KEEPALIVE_S,
+        shutdown_timeout=0.5,
+    )
+    await runner.setup()
+    assert runner.server is not None  # noqa: S101  setup has made it
+    connections = Connections(runner.server, listener, context)
+    try:
+        async with asyncio.TaskGroup() as group:
+            accepting = group.create_task(connections.accept(group))
+            yield
+            accepting.cancel()
+    finally:
+        await runner.cleanup()
+
+
+class Connections:
+    """Open connections: so many in all and of a host.
+
+    aiohttp closes a connection without a request after _KEEPALIVE_S, the kernel one that does not
+    take an answer for SLOW_READER_S.
+
+    Args:
+        server: Handles the requests.
+        listener: Its connections are accepted.
+        context: TLS settings.
+    """
+
+    def __init__(
+        self, server: web.Server, listener: socket.socket, context: ssl.SSLContext | None
+    ) -> None:
+        self._server = server
+        self._listener = listener
+        self._context = context
+        self._beginning: Counter[str] = Counter()
+        """Connections in their TLS handshake, by host."""
+
+    async def accept(self, group: asyncio.TaskGroup) -> None:
+        """Accept connections until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                sock, address = await loop.sock_accept(self._listener)
+            except OSError as exc:  # out of descriptors: those that close free some
+                logger.warning("no connection can be accepted: %s", exc.strerror)
+                await asyncio.sleep(1.0)
+                continue
+            host = str(address[0])
+            if self._is_full(host):
+                sock.close()
+                continue
+            group.create_task(self._begin(sock, host))
+
+    def _is_full(self, host: str) -> bool:
+        hosts = Counter(self._beginning)
+        for handler in self._server.connections:
+            peer = handler.transport and handler.transport.get_extra_info("peername")
+            hosts[str(peer[0]) if peer else ""] += 1
+        return hosts.total() >= MAX_CONNECTIONS or hosts[host] >= MAX_PER_HOST
+
+    async def _begin(self, sock: socket.socket, host: str) -> None:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(SLOW_READER_S * 1000))
+        self._beginning[host] += 1
+        timeouts = {} if self._context is None else {"ssl_handshake_timeout": HANDSHAKE_S}
+        try:
+            await asyncio.get_running_loop().connect_accepted_socket(
+                self._server, sock, ssl=self._context, **timeouts
+            )
+        except OSError as exc:  # ssl.SSLError, too: no TLS, or none that is known here
+            logger.debug("connection from %s: %s", host, exc)
+            sock.close()
+        finally:
+            self._beginning[host] -= 1
+            if not self._beginning[host]:
+                del self._beginning[host]
