@@ -154,8 +154,9 @@ def test_recorder_goes_on_when_processes_are_killed(recordings: Recordings) -> N
     values, frames = recordings.stop("killed"), recordings.stop("framed")
     assert (values["lost"], len(values["files"])) == (0, 1)
     assert (frames["lost"], len(frames["files"])) == (0, 1)
-    (event,) = describe(Path(values["files"][0])).events
-    assert "the engine was restarted" in event.text
+    events = describe(Path(values["files"][0])).events
+    assert events
+    assert all("the engine was restarted" in event.text for event in events)
 
 
 def test_recording_that_is_killed_is_listed_and_readable(recordings: Recordings) -> None:
@@ -294,8 +295,8 @@ def test_file_that_exists_is_not_overwritten(recordings: Recordings) -> None:
 
 
 def test_recording_waits_while_its_plant_does_not_run(farm: Plants, tmp_path: Path) -> None:
-    farm.write(OVEN, "oven.yaml")
-    plant = farm.write(PLANT.replace("127.9.61", "127.9.62"))
+    without_bus = "".join(line for line in PLANT.splitlines(keepends=True) if "bus0" not in line)
+    plant = farm.write(without_bus.replace("127.9.61", "127.9.62"))
     first = farm.run(plant)
     recordings = Recordings(first, tmp_path)
     recordings.start("patient", "left/ticks")
