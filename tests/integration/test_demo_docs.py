@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Iterator
+from contextlib import chdir
+from pathlib import Path
 
 import pytest
 
 from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
-from tests.support.pages import ROOT, run_examples
+from tests.support.pages import ROOT, commands, run_examples
 
 pytestmark = pytest.mark.net
 
@@ -96,6 +99,36 @@ def test_trace_and_scan_print_the_shown_output(demo: Appliance) -> None:
         assert done.returncode == 0, done.stderr
         lines = plain(done.stdout)
         assert lines[: len(plain(printed))] == plain(printed)
+
+
+@pytest.fixture
+def _own_folder(tmp_path: Path) -> Iterator[None]:
+    with chdir(tmp_path):
+        yield
+
+
+@pytest.mark.usefixtures("_own_folder")
+def test_recordings_page_examples_run_and_print_the_shown_output(demo: Appliance) -> None:
+    page = (DOCS / "recordings.md").read_text()
+    examples = [
+        example
+        for block in re.findall(r"```console\n(.*?)```", page, re.DOTALL)
+        for example in commands(block)
+    ]
+    assert len(examples) >= 9
+    for command, printed in examples:
+        if command == "eapctl record snapshot":
+            wait_until(lambda: '"ring_s":0.0' not in demo.command("record", "list", "--json"))
+        done = run_eapctl(demo.runtime, *shlex.split(command)[1:])
+        assert done.returncode == 0, (command, done.stderr)
+        if printed:
+            assert countless(done.stdout) == countless(printed)
+
+
+def countless(text: str) -> list[str]:
+    """Return the lines without folders and numbers of messages."""
+    text = re.sub(r"/\S*/", "/", text)
+    return re.sub(r"\d+ (messages|frames), (none|\d+) lost", r"N \1, N lost", text).splitlines()
 
 
 def plain(text: str) -> list[str]:
