@@ -193,6 +193,27 @@ def test_ports_of_one_interface_hear_each_other(ends):
     assert far.drain(1) == [expect(1)]
 
 
+def test_exchanged_handler_takes_the_frames_of_the_other_and_none_of_its_own_port(ends):
+    first, second = (Listener(ends[0]) for _ in range(2))
+    far = Listener(ends[1])
+    plain, seen = first.port.handler, []
+
+    def tapped(data, size, at_ns, origin):
+        seen.append(bytes(data[:3]))
+        plain(data, size, at_ns, origin)
+
+    first.port.exchange_handler(plain, tapped)
+    second.port.send([second.frame(1)], 0)
+    first.port.send([first.frame(2)], 0)
+    far.port.send([far.frame(3)], 0)
+    assert first.drain(2) == [expect(1), expect(3)]
+    assert seen == first.got
+    first.port.exchange_handler(tapped, plain)
+    second.port.send([second.frame(4)], 0)
+    assert first.drain(3)[-1] == expect(4)
+    assert len(seen) == 2
+
+
 def test_neighbours_that_are_never_drained_do_not_fill_the_memory(ends):
     sender = Listener(ends[0])
     Listener(ends[0])

@@ -27,8 +27,9 @@ SECOND = 1_000_000_000
 class Listener:
     def __init__(self):
         self.got = []
+        self.take = self._take  # one object, as the handlers of a station are
 
-    def take(self, data, size, _at_ns, _origin):
+    def _take(self, data, size, _at_ns, _origin):
         self.got.append(bytes(data[:size]))
 
 
@@ -72,6 +73,23 @@ def test_each_frame_goes_its_way(plant):
     assert taken.got == [b"\x01\x40\x01", b"\x01\x40\x03"]
     assert heard.got == [b"\x01\x40\x02"]
     assert near.errors == {}
+
+
+def test_exchanged_handlers_take_datagrams_connections_and_answers(plant):
+    near, far, heard, taken = plant
+    answers, tap, answered = Listener(), Listener(), Listener()
+    near.follow({TCP}, [answers.take])
+    far.exchange_handler(heard.take, tap.take)
+    far.exchange_handler(taken.take, tap.take)
+    near.send([frame(1, TCP), frame(2, "127.0.3.24")], 0)
+    drain_until(far, lambda: len(tap.got) == 2)
+    assert heard.got == taken.got == []
+    near.drain(0)  # its connection listens for answers from now on
+    near.exchange_handler(answers.take, answered.take)
+    (receiver,) = far._receivers
+    assert far.send([frame(3, receiver.name)], 0) == []
+    drain_until(near, lambda: answered.got)
+    assert (answered.got, answers.got) == ([b"\x01\x40\x03"], [])
 
 
 def test_frames_that_find_no_connection_are_returned_and_counted():
