@@ -28,6 +28,7 @@ START_S = 20.0
 """Time for a recorder to report that it records."""
 ANSWER_S = 30.0
 """Time for an answer of a recorder: a file may have to be finished."""
+_ROOT = str(Path(__file__).parents[2])
 _NEEDED = ("mcap", "zstandard")
 
 
@@ -172,7 +173,9 @@ def _spawn(options: RecorderOptions) -> RecordingState:
         stderr=subprocess.PIPE,
         # Away from the terminal: its Ctrl-C and its end are not meant for the recorder.
         start_new_session=True,
+        # No folder is kept from being unmounted; a program that runs from its folder is found.
         cwd="/",
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (_ROOT, _given_path())))},
     )
     assert process.stdout is not None  # noqa: S101  PIPE was given
     assert process.stderr is not None  # noqa: S101  PIPE was given
@@ -194,6 +197,10 @@ def _spawn(options: RecorderOptions) -> RecordingState:
     # It lives on; this process must not warn that it was left alone.
     process.returncode = 0
     return answer.state
+
+
+def _given_path() -> str:
+    return os.environ.get("PYTHONPATH", "")
 
 
 def _ask(name: str, request: RecorderRequest) -> RecordingState:

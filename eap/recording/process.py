@@ -85,20 +85,30 @@ class RecorderProcess:
                 look_ns = recorder.look(now_ns)
                 if not is_reported and recorder.is_settled:
                     is_reported = True
-                    state = recorder.check(now_ns)
-                    self._folder.write(state)  # for a list that is asked for right after the start
-                    report(RecorderAnswer(state=state))
+                    # Written before: a list may be asked for right after the start.
+                    report(RecorderAnswer(state=self._describe(now_ns)))
             if now_ns >= check_ns:
                 check_ns = now_ns + _CHECK_NS
-                self._folder.write(recorder.check(now_ns))
+                self._describe(now_ns)
             self._serve(min(look_ns, check_ns) - monotonic_ns())
-        state = recorder.check(monotonic_ns())
-        self._folder.write(state)
+        state = self._describe(monotonic_ns())
         if not is_reported:
             report(RecorderAnswer(error=state.reason))
         for client in self._ending:
             self._answer(client, RecorderAnswer(state=state))
         return 1 if recorder.has_failed else 0
+
+    def _describe(self, now_ns: int) -> RecordingState:
+        """Write the state of the recording to its folder, and return it."""
+        state = self._recorder.check(now_ns)
+        try:
+            self._folder.write(state)
+        except FileNotFoundError:
+            # Nobody could find the recording, or end it.
+            self._recorder.end("its folder in the runtime directory was removed", now_ns)
+        except OSError:
+            pass  # the runtime directory is full: the recording goes on
+        return state
 
     def _serve(self, timeout_ns: int) -> None:
         """Serve requests for *timeout_ns*, or until the first."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -284,6 +285,13 @@ def test_wrong_options_are_refused(
     assert problem in done.stderr
     assert done.returncode == code
     assert "wrong" not in recordings.appliance.command("record", "list")
+
+
+def test_recorder_ends_in_order_when_its_folder_is_removed(recordings: Recordings) -> None:
+    state = recordings.start("homeless", "left/ticks")
+    recordings.wait_messages("homeless", 20)
+    shutil.rmtree(recordings.appliance.runtime / ".recordings" / "homeless")
+    wait_until(lambda: describe(Path(state["files"][0])).finished)
 
 
 def test_file_that_exists_is_not_overwritten(recordings: Recordings) -> None:
