@@ -8,6 +8,8 @@ import struct
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from eap.ads.request import ReadWrite, decode_outcome, encode_query
 from eap.ams.access import AccessList
@@ -177,3 +179,10 @@ def test_any_position_and_length_of_a_part_is_answered(position: int, length: in
     (ticket,) = struct.unpack_from("<I", data)
     result, more = appliance.ask(ControlOffset.PART, struct.pack("<II", ticket, position), length)
     assert (result, len(more) <= 8 + len(data) + 600) == (0, True)
+
+
+@given(st.binary(max_size=60) | st.text(max_size=40).map(str.encode))
+def test_any_request_is_answered_with_a_line_of_the_protocol(line: bytes) -> None:
+    result, data = Appliance().ask(ControlOffset.REQUEST, line)
+    assert result == 0
+    assert json.loads(data[8:])["v"] == 1
