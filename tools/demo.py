@@ -28,6 +28,7 @@ from eap.cli.output import Column, Styled, TextTable, repaint
 from eap.errors import EapError
 from eap.quantities import duration
 from eap.runtime.attach import AttachedStation
+from eap.runtime.folder import find_running
 
 PLANT = Path("config/demo.yaml")
 EAPCTL = Path(sys.executable).with_name("eapctl")
@@ -169,13 +170,16 @@ def show(
     start = monotonic()
     end = start + seconds if seconds is not None else float("inf")
     meter = RateMeter()
+    page = ""
     if is_terminal:
         print(CLEAR_SCREEN, end="")
     while goes_on(appliance, end, REFRESH_S if is_terminal else LINE_S):
         look = read_snapshot(stations, monotonic() - start)
         rates = meter.rates(look)
+        if not page and (page := page_text(appliance.pid)) and not is_terminal:
+            print(f"make demo: {page}", flush=True)
         if is_terminal:
-            repaint([as_screen(look, rates)])
+            repaint([as_screen(look, rates, page)])
         else:
             print(as_line(look, rates), flush=True)
 
@@ -189,6 +193,18 @@ def goes_on(appliance: subprocess.Popen[str], end: float, pause_s: float) -> boo
     except subprocess.TimeoutExpired:
         return True
     return False
+
+
+def page_text(supervisor: int) -> str:
+    """Return the address of the page, or why there is none; empty while it starts."""
+    for _, info in find_running():
+        web = info.extras.get("web")
+        if info.supervisor == supervisor and web is not None:
+            if web.fault:
+                return f"no page in a browser: {web.fault}"
+            if url := web.report.get("url"):
+                return f"open {url} in a browser"
+    return ""
 
 
 def read_snapshot(stations: list[AttachedStation], at_s: float) -> Look:
@@ -224,7 +240,7 @@ class RateMeter:
         }
 
 
-def as_screen(look: Look, rates: Mapping[Endpoint, float]) -> RenderableType:
+def as_screen(look: Look, rates: Mapping[Endpoint, float], page: str = "") -> RenderableType:
     """Return stations, their values, and the arrows between them; at most 80 columns, 23 lines."""
     stations = TextTable(*(Column(name, rank=number) for number, name in enumerate(SHOWN)))
     for row in zip_longest(*(cells(look.values[name], SHOWN[name]) for name in SHOWN)):
@@ -234,7 +250,7 @@ def as_screen(look: Look, rates: Mapping[Endpoint, float]) -> RenderableType:
         stations,
         Styled(),
         arrows(look, rates),
-        Styled("\nCtrl-C ends it; try in another terminal:", style="dim"),
+        Styled(f"\nCtrl-C ends it; {page or 'try in another terminal'}:"[:80], style="dim"),
         Styled("  eapctl status    eapctl pd set island-01 setpoint 75", style="dim"),
     )
 

@@ -154,5 +154,5 @@ async def site(section: WebSection, plant: StubPlant | None = None) -> AsyncIter
             yield found
         finally:
             for client in found._clients:
-                await client.session.close()
+                await client.close()
             await test_server.close()

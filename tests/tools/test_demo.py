@@ -56,6 +56,18 @@ def test_demo_screen_fits_80x24_and_does_not_move_with_its_values() -> None:
     assert [line.find("►") for line in small] == [line.find("►") for line in large]
 
 
+@pytest.mark.parametrize(
+    "page", ["open http://127.0.0.1:8080/ in a browser", "no page: " + "x" * 99]
+)
+def test_demo_screen_with_a_page_fits_80x24(page: str) -> None:
+    console = Console(file=io.StringIO(), width=80, highlight=False)
+    console.print(as_screen(look(1, 0), {}, page))
+    shown = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert len(shown) < 24
+    assert max(map(len, shown)) <= 80
+    assert page[:40] in "".join(shown)
+
+
 def test_demo_screen_shows_an_interrupted_path() -> None:
     assert sum("── x ──" in line for line in lines(look(1, 0, state="stale", age_us=None), {})) == 5
 

@@ -29,7 +29,7 @@ from tools.bench.network import ROOT
 from tools.bench.settings import Settings, quick
 
 NAMES = (
-    "throughput", "latency", "poll", "lateness", "solar", "recording", "limits", "receive",
+    "throughput", "latency", "poll", "lateness", "solar", "recording", "web", "limits", "receive",
     "objects", "change", "routing", "ads", "gateway", "files", "startup", "acyclic", "cycle",
     "plantbus", "recovery", "segment",
 )  # fmt: skip
