@@ -60,39 +60,41 @@ def write_parquet(
             for row in rows:
                 for position, name, kind, is_text in plans[row.source]:
                     value = row.values[position]
-                    batch.cells[name].append(plain_value(kind, value) if is_text else value)
+                    batch.row[name] = plain_value(kind, value) if is_text else value
             batch.end_row(at_ns)
         batch.write()
     return ExportCount(batch.count, len(names))
 
 
 class _Batch:
-    """Rows of one row group."""
+    """Rows of one row group; *row* has the values of the next one."""
 
     def __init__(self, writer: Any, schema: Any, names: list[str]) -> None:
         self._writer = writer
         self._schema = schema
         self._times: list[int] = []
-        self.cells: dict[str, list[Any]] = {name: [] for name in names}
+        self._cells: dict[str, list[Any]] = {name: [] for name in names}
+        self.row: dict[str, Any] = {}
         self.count = 0
 
     def end_row(self, at_ns: int) -> None:
         self._times.append(at_ns)
         self.count += 1
-        for cells in self.cells.values():
-            if len(cells) < len(self._times):
-                cells.append(None)
+        # By name: a variable in several PDs has one cell.
+        for name, cells in self._cells.items():
+            cells.append(self.row.get(name))
+        self.row.clear()
         if len(self._times) >= _BATCH:
             self.write()
 
     def write(self) -> None:
         arrays = [pa.array(self._times, pa.int64())]
         arrays += [
-            pa.array(cells, self._schema.field(name).type) for name, cells in self.cells.items()
+            pa.array(cells, self._schema.field(name).type) for name, cells in self._cells.items()
         ]
         self._writer.write_table(pa.Table.from_arrays(arrays, schema=self._schema))
         self._times.clear()
-        for cells in self.cells.values():
+        for cells in self._cells.values():
             cells.clear()
 
 

@@ -7,13 +7,21 @@ import struct
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 from pyarrow import parquet
 
 from eap.errors import ConfigError
 from eap.ops.recordings import ExportRequest, ExportResult, export_recording
+from eap.recording.export import write_csv
 from eap.recording.frames_reader import FramesFile
+from eap.recording.messages import RecordedVariable
+from eap.recording.parquet import write_parquet
+from eap.recording.published import RecordedPd
 from eap.recording.recording_file import describe, open_recording
+from eap.recording.rows import ALL, select
 from tests.support.recordings import CYCLE_NS, PUBLISHED, T0, sample, write_frames, write_values
+
+BYTE, BLOCK = RecordedVariable("byte", "USINT"), RecordedVariable("block", "BLOCK(5)")
 
 
 @pytest.fixture(scope="module")
@@ -174,3 +182,20 @@ def test_pds_of_a_plant_file_give_a_capture_its_variables(tmp_path: Path) -> Non
     published = published_in(Path("config/demo.yaml"))
     assert {frame.station for frame in published} == {"island-01", "island-02", "island-03"}
     assert all(frame.pds and frame.pds[0].variables for frame in published)
+
+
+def test_variable_in_several_pds_has_one_cell(frames: Path, tmp_path: Path) -> None:
+    # The counter of the first PD is the first two bytes of the second one, too.
+    (frame,) = PUBLISHED
+    twice = RecordedPd(name="x", pd_id=102, version=1, size=1, variables=(BYTE,))
+    first = RecordedPd(name="y", pd_id=101, version=1, size=6, variables=(BLOCK, BYTE))
+    frame = structs.replace(frame, pds=(first, twice))
+    recording = FramesFile(frames, (frame,))
+    selection = select(recording.sources, [])
+    write_parquet(recording, ALL, selection, tmp_path / "a.parquet")
+    table = parquet.read_table(tmp_path / "a.parquet").to_pydict()
+    assert table["island-01/byte"] == [n & 0xF for n in range(300)]
+    lines: list[str] = []
+    write_csv(recording, ALL, selection, lines.append)
+    assert len(lines) == 301
+    assert lines[20].endswith(",3\n")
