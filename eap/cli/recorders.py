@@ -88,6 +88,7 @@ def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -
         "eapctl record start 'island-*/temp' -o temp --every 100ms --split 1h --keep 24",
         "eapctl record start island-03 --frames -o island --for 60s",
         "eapctl record start -o fault --ring 60s --when 'island-03/temp>80 or lost'",
+        "eapctl record start --to postgresql://logger@db.example/plant",
     ),
 )
 @click.argument("patterns", nargs=-1, metavar="[PATTERN]...")
@@ -144,6 +145,12 @@ def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -
     metavar="N",
     help="Keep the last N files of this recording, and remove older ones.",
 )
+@click.option(
+    "--to",
+    metavar="URL",
+    help="Send values to a store instead: postgresql://host/database, influx+http://host/path,"
+    " influx+udp://host.",
+)
 @plant_option
 @json_option("Print one object: the state of the recording.")
 def start(
@@ -158,6 +165,7 @@ def start(
     after_ns: int | None,
     split: tuple[int, int],
     keep: int | None,
+    to: str | None,
     plant: str | None,
     output: Renderer,
 ) -> None:
@@ -175,6 +183,8 @@ def start(
     from eap.recording.recorder import RecorderOptions
 
     _check_options(kind, every, ring_ns, when, before_ns, after_ns)
+    if to and (kind == "frames" or ring_ns or when or split != (0, 0) or keep):
+        raise click.UsageError("--to takes values as they come: without --frames, a ring, or files")
     if when is not None:
         try:
             Condition(when)
@@ -200,6 +210,7 @@ def start(
         split_ns=split[0],
         split_bytes=split[1],
         keep=keep or 0,
+        to=to or "",
     )
     output.show(start_recording(options, plant, target), _started)
 
@@ -230,7 +241,8 @@ def _started(state: RecordingState) -> str:
         when = state.options.get("when")
         until = f"until {when}" if when else "for 'eapctl record snapshot'"
         return f"{begin} in memory, {until}; {end}"
-    return f"{begin} to {state.files[-1]}; {end}"
+    target = state.files[-1] if state.files else state.options.get("to", "")
+    return f"{begin} to {target}; {end}"
 
 
 @click.command("list", epilog=examples("eapctl record list", "eapctl record list --json"))
@@ -293,8 +305,9 @@ def snapshot(name: str | None, output: Renderer) -> None:
 def _ended(states: Iterable[RecordingState]) -> Iterator[str]:
     for state in states:
         things = "message" if state.kind == "values" else "frame"
-        lost = f"{state.lost} lost" if state.lost else "none lost"
-        files = ", ".join(state.files) or "no file"
+        missing = state.lost + state.not_stored
+        lost = f"{missing} lost" if missing else "none lost"
+        files = ", ".join(state.files) or state.options.get("to", "no file")
         yield f"recording {state.name!r}: {count(state.messages, things)}, {lost}; {files}"
 
 

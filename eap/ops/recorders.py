@@ -18,9 +18,10 @@ from eap.expressions import Condition
 from eap.net.image_file import open_image
 from eap.pd.image import Image
 from eap.recording.capture import find_name
-from eap.recording.process import RecorderAnswer, RecorderRequest
+from eap.recording.process import STORE_VARIABLE, RecorderAnswer, RecorderRequest
 from eap.recording.recorder import ENDINGS, RecorderOptions
 from eap.recording.selection import check_patterns
+from eap.recording.stores import check_url, shown_url
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, describe_roots, find_running
 from eap.runtime.recordings import RecordingFolder, RecordingState, find_recordings
 
@@ -45,6 +46,7 @@ def start_recording(
     Raises:
         ControlError: no plant fits, a pattern selects nothing, or the recorder cannot record.
         EnvironmentalError: files of that name exist, or a package is missing.
+        ConfigError: the URL of ``to`` is that of no store.
     """
     _require_packages(options)
     folder, info = _find_plant(options.patterns, plant)
@@ -53,7 +55,10 @@ def start_recording(
     base = Path(os.path.abspath(target or info.plant))  # noqa: PTH100  resolve() follows links
     if base.suffix == ending:
         base = base.with_suffix("")
-    _check_target(base, ending)
+    if options.to:
+        check_url(options.to)
+    else:
+        _check_target(base, ending)
     filled = msgspec.structs.replace(
         options,
         name=options.name or base.name,
@@ -166,6 +171,9 @@ def _check_target(base: Path, ending: str) -> None:
 
 def _spawn(options: RecorderOptions) -> RecordingState:
     command = [sys.executable, "-m", "eap.recording.process"]
+    paths = os.pathsep.join(filter(None, (_ROOT, _given_path())))
+    environment = os.environ | {"PYTHONPATH": paths, STORE_VARIABLE: options.to}
+    options = msgspec.structs.replace(options, to=shown_url(options.to))
     process = subprocess.Popen(  # noqa: S603  our own module
         [*command, msgspec.json.encode(options).decode()],
         stdin=subprocess.DEVNULL,
@@ -175,7 +183,7 @@ def _spawn(options: RecorderOptions) -> RecordingState:
         start_new_session=True,
         # No folder is kept from being unmounted; a program that runs from its folder is found.
         cwd="/",
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (_ROOT, _given_path())))},
+        env=environment,
     )
     assert process.stdout is not None  # noqa: S101  PIPE was given
     assert process.stderr is not None  # noqa: S101  PIPE was given

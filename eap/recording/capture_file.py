@@ -30,6 +30,8 @@ ETHERNET = 1
 """Link type of Ethernet in both file formats."""
 _LARGEST_BLOCK = 1 << 24
 _NS = 1_000_000_000
+LATEST_NS = 1 << 62
+"""A later time, in the year 2116 and after, is damage, and becomes this one."""
 
 
 class CaptureInterface(NamedTuple):
@@ -195,7 +197,8 @@ class CaptureFile:
             elif code == COMMENT:
                 comments += (content.decode("utf-8", "replace"),)
         octets = body[20 : 20 + size]
-        return CapturePacket(at_ns + described.offset * _NS, interface, octets, outbound, comments)
+        at_ns = min(max(at_ns + described.offset * _NS, 0), LATEST_NS)
+        return CapturePacket(at_ns, interface, octets, outbound, comments)
 
     def _add_statistics(self, body: bytes) -> None:
         (interface,) = struct.unpack_from(f"{self._order}I", body)

@@ -12,13 +12,14 @@ from eap.errors import EapError
 from eap.recording.capture import Block, Gap
 from eap.recording.files import FileSequence, OpenFile
 from eap.recording.header import RecordingEvent
+from eap.recording.stores import StoreSequence
 
 QUEUE_BYTES = 128 << 20
 """Bytes that may wait for the disk; a block beyond that is lost, and counted."""
 _FLUSH_S = 0.5
 """Time of which a killed recorder, or a machine that stops, loses the data at most."""
 
-Step: TypeAlias = Callable[[FileSequence], object]
+Step: TypeAlias = "Callable[[FileSequence | StoreSequence], object]"
 
 
 class DiskThread:
@@ -31,7 +32,7 @@ class DiskThread:
         failure: Reason that the thread has ended by itself; empty while it works.
     """
 
-    def __init__(self, files: FileSequence) -> None:
+    def __init__(self, files: FileSequence | StoreSequence) -> None:
         self.failure = ""
         self._files = files
         self._steps: queue.SimpleQueue[tuple[Step, int] | None] = queue.SimpleQueue()
@@ -64,7 +65,7 @@ class DiskThread:
         """End the present file; the event is set when that is done, or cannot be done."""
         done = threading.Event()
 
-        def close(files: FileSequence) -> None:
+        def close(files: FileSequence | StoreSequence) -> None:
             try:
                 files.close(time_ns)
             finally:
@@ -84,11 +85,11 @@ class DiskThread:
             self._waiting += size
         self._steps.put((step, size))
 
-    def _begin(self, files: FileSequence, make: OpenFile, time_ns: int) -> None:
+    def _begin(self, files: FileSequence | StoreSequence, make: OpenFile, time_ns: int) -> None:
         self._open = make
         files.open(make, time_ns)
 
-    def _write(self, files: FileSequence, block: Block) -> None:
+    def _write(self, files: FileSequence | StoreSequence, block: Block) -> None:
         if self._open is not None and files.is_due(block.first_ns):
             files.open(self._open, block.first_ns)
         files.write(block)
@@ -99,7 +100,7 @@ class DiskThread:
             try:
                 item = self._steps.get(timeout=_FLUSH_S)
             except queue.Empty:
-                item = (FileSequence.flush, 0)
+                item = (_flush, 0)
             if item is None:
                 return
             step, size = item
@@ -115,3 +116,7 @@ class DiskThread:
                 self.failure = self.failure or str(exc)
             except Exception as exc:  # noqa: BLE001  without this thread nothing would be written
                 self.failure = self.failure or f"{type(exc).__name__}: {exc}"
+
+
+def _flush(files: FileSequence | StoreSequence) -> None:
+    files.flush()

@@ -10,6 +10,7 @@ from eap.codec.basetypes import Boolean, DataType
 from eap.codec.enumerations import Enumeration
 from eap.codec.times import Timed
 from eap.errors import ConfigError
+from eap.recording.capture_file import LATEST_NS
 from eap.recording.frames_reader import FramesFile, events_in
 from eap.recording.frames_writer import EVENT_COMMENT, FramesWriter
 from eap.recording.header import RecordingHeader
@@ -228,7 +229,7 @@ def header_of(recording: Recording) -> RecordingHeader:
     return RecordingHeader(
         plant=facts.get("plant", ""),
         host=facts.get("host", ""),
-        started_ns=int(started) if started.isdecimal() else recording.first_ns or 0,
+        started_ns=min(int(started[:20]), LATEST_NS) if started.isdecimal() else 0,
         options={name: text for name, text in facts.items() if name not in own},
         files=tuple(recording.files),
         published=recording.published,

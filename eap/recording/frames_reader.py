@@ -100,10 +100,16 @@ class FramesFile:
         """None: a frame is read or it is not there."""
         return 0
 
-    def frames(self) -> Iterator[FramePacket]:
-        """Yield all frames in the order of the file."""
+    def frames(self, *, once: bool = False) -> Iterator[FramePacket]:
+        """Yield all frames in the order of the file.
+
+        With *once*, received frames are left out where the ports of all senders were recorded.
+        """
+        leaves_out = once and bool(self._own) and set(self._own.values()) <= set(self.interfaces)
         with self.path.open("rb") as file:
             for captured in _tolerant(CaptureFile(file, str(self.path))):
+                if leaves_out and captured.outbound is False:
+                    continue
                 packet = unwrap(captured.octets)
                 if packet is None:
                     continue
@@ -133,7 +139,7 @@ class FramesFile:
         taken_from = {
             publisher: port for publisher, port in self._own.items() if port in interfaces
         }
-        for captured, _, data in self.frames():
+        for captured, _, data in self.frames(once=True):
             if captured.at_ns not in window or (frame := self.pds_of(data)) is None:
                 continue
             publisher, cycle, pds = frame

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from eap.errors import EnvironmentalError, MalformedError
+from eap.recording.capture_file import LATEST_NS
 
 try:
     import lz4.frame
@@ -205,9 +206,8 @@ class McapFile:
                 return
             if code == MESSAGE and length >= _MESSAGE_HEAD.size:
                 channel, sequence, time_ns, _ = _MESSAGE_HEAD.unpack_from(content, start)
-                yield McapMessage(
-                    channel, sequence, time_ns, content[start + _MESSAGE_HEAD.size : end], at
-                )
+                data = content[start + _MESSAGE_HEAD.size : end]
+                yield McapMessage(channel, sequence, min(time_ns, LATEST_NS), data, at)
             else:
                 self._enter_definition(code, content[start:end])
             at = end
@@ -287,8 +287,8 @@ class McapFile:
         return McapChunk(
             start - RECORD.size,
             RECORD.size + length,
-            first_ns,
-            last_ns,
+            min(first_ns, LATEST_NS),
+            min(last_ns, LATEST_NS),
             size,
             crc,
             compression,

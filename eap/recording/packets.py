@@ -9,8 +9,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
-from ipaddress import IPv4Address
 from pathlib import Path
+from socket import inet_ntoa
 from typing import BinaryIO, NamedTuple
 
 from eap.codec.ethercat import EAP_PORT, ETHERTYPE, EtherCatHeader
@@ -78,8 +78,7 @@ def _unwrap_ipv4(octets: bytes, vlan_id: int | None) -> Packet | None:
     if EAP_PORT not in ports:
         return None
     source, destination = (
-        f"{IPv4Address(octets[at : at + 4])}:{port}"
-        for at, port in zip((12, 16), ports, strict=True)
+        f"{inet_ntoa(octets[at : at + 4])}:{port}" for at, port in zip((12, 16), ports, strict=True)
     )
     if protocol == _UDP:
         return Packet("udp", source, destination, vlan_id, body[8:])

@@ -29,6 +29,10 @@ _MAX_LINE = 65_536
 _MAX_CLIENTS = 16
 
 
+STORE_VARIABLE = "EAP_RECORD_TO"
+"""Environment variable with the URL of the store."""
+
+
 class RecorderRequest(msgspec.Struct, kw_only=True):
     """One request; *do* is ``state``, ``mark``, ``snapshot`` or ``stop``."""
 
@@ -173,6 +177,9 @@ class RecorderProcess:
 def main(arguments: list[str]) -> int:
     """Record as ``arguments[0]``, RecorderOptions as JSON, says; return the exit code."""
     options = msgspec.json.decode(arguments[0], type=RecorderOptions)
+    if options.to:
+        # With its password, which arguments would show to all users of this host.
+        options = msgspec.structs.replace(options, to=os.environ.pop(STORE_VARIABLE, options.to))
     try:
         folder = RecordingFolder.claim(options.name)
     except EapError as exc:

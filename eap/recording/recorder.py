@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from time import monotonic_ns
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
 
@@ -35,15 +35,17 @@ from eap.recording.capture import (
 )
 from eap.recording.condition import ConditionWatch
 from eap.recording.disk import DiskThread
-from eap.recording.files import FileSequence, OpenFile, RecordingFile
+from eap.recording.files import FileSequence, RecordingFile
 from eap.recording.header import EventKind, RecordingEvent
 from eap.recording.published import published_by
 from eap.recording.ring import BlockRing, Trigger, TriggerAction
 from eap.recording.selection import matcher, select_variables
 from eap.recording.sinks import FramesSink, ValuesSink, header_of, placed_variables
+from eap.recording.stores import StoreSequence, StoreSink, make_store, shown_url
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo
 from eap.runtime.recordings import RecordingState
 
+Sequenced: TypeAlias = FileSequence | StoreSequence
 ENDINGS = {"values": ".mcap", "frames": ".pcapng"}
 _LOOK_NS = 50_000_000
 _SHORTEST_LOOK_NS = 2_000_000
@@ -74,6 +76,7 @@ class RecorderOptions(msgspec.Struct, frozen=True, kw_only=True):
         split_bytes: Largest size of a file.
         keep: Number of files.
         for_ns: Time of the whole recording.
+        to: URL of a store that takes the values instead of files.
     """
 
     name: str
@@ -92,6 +95,7 @@ class RecorderOptions(msgspec.Struct, frozen=True, kw_only=True):
     split_bytes: int = 0
     keep: int = 0
     for_ns: int = 0
+    to: str = ""
     room: int | None = None
 
     def texts(self) -> dict[str, str]:
@@ -108,6 +112,7 @@ class RecorderOptions(msgspec.Struct, frozen=True, kw_only=True):
             "split": f"{self.split_bytes} B" if self.split_bytes else _seconds(self.split_ns),
             "keep": str(self.keep or ""),
             "for": _seconds(self.for_ns),
+            "to": shown_url(self.to) if self.to else "",
         }
         return {name: text for name, text in found.items() if text}
 
@@ -201,13 +206,15 @@ class Attachment(Closeable):
         before, self.layouts = self.layouts, layouts
         return layouts != before and self._facts(layouts) != self._facts(before)
 
-    def file_maker(self) -> OpenFile:
-        """Return the function that opens files of what is recorded now."""
+    def file_maker(self, sequence: Sequenced) -> Callable[[Path, int], Any]:
+        """Return the function that opens files in *sequence* of what is recorded now."""
         # Another thread calls it, perhaps after the layouts have changed.
         options, layouts, frames, info = self._options, self.layouts, self.frames, self.info
 
-        def make(path: Path, time_ns: int) -> RecordingFile:
+        def make(path: Path, time_ns: int) -> RecordingFile | StoreSink:
             header = header_of(info, layouts, options.texts(), time_ns)
+            if isinstance(sequence, StoreSequence):
+                return StoreSink(sequence, header, layouts, options.patterns)
             if frames is None:
                 return ValuesSink(path, header, layouts, options.patterns)
             return FramesSink(path, header, layouts, options.patterns, lambda: frames.ports)
@@ -275,15 +282,19 @@ class Recorder:
         self._attach_ns = 0
         self._end_ns = now_ns + options.for_ns if options.for_ns else None
         has_ring = bool(options.ring_ns)
-        self._files = FileSequence(
-            Path(options.base),
-            ENDINGS[options.kind],
-            numbered=has_ring or bool(options.split_ns or options.split_bytes),
-            split_ns=options.split_ns,
-            split_bytes=options.split_bytes,
-            keep=options.keep,
-            room=options.room,
-        )
+        self._files: Sequenced
+        if options.to:
+            self._files = StoreSequence(make_store(options.to), options.to)
+        else:
+            self._files = FileSequence(
+                Path(options.base),
+                ENDINGS[options.kind],
+                numbered=has_ring or bool(options.split_ns or options.split_bytes),
+                split_ns=options.split_ns,
+                split_bytes=options.split_bytes,
+                keep=options.keep,
+                room=options.room,
+            )
         self._ring = _make_ring(options.ring_ns) if has_ring else None
         self._trigger = Trigger(options.before_ns, options.after_ns)
         self._events: deque[tuple[int, RecordingEvent | Gap]] = deque(maxlen=_KEPT_EVENTS)
@@ -325,6 +336,10 @@ class Recorder:
                 self._detach("the plant does not run")
         state = self.state
         state.messages, state.octets = self._files.messages, self._files.octets
+        if isinstance(self._files, StoreSequence):
+            state.not_stored = self._files.lost
+            if state.state == "recording":
+                state.reason = self._files.trouble
         state.files = [str(path) for path in self._files.paths]
         state.triggers = self._trigger.count
         if self._ring is not None:
@@ -414,7 +429,7 @@ class Recorder:
     def _take(self, attached: Attachment, now_ns: int, offset_ns: int) -> None:
         if self._needs_file:
             self._needs_file = False
-            self._disk.open(attached.file_maker(), now_ns + offset_ns)
+            self._disk.open(attached.file_maker(self._files), now_ns + offset_ns)
             self._write_events(0)
         ring, is_writing = self._ring, self._ring is None or self._trigger.is_recording
         for blocks, gaps in attached.looks(offset_ns):
@@ -457,7 +472,7 @@ class Recorder:
         assert ring is not None  # noqa: S101  only recordings with a ring come here
         blocks = list(ring.since(since_ns))
         first_ns = blocks[0].first_ns if blocks else since_ns
-        self._disk.open(attached.file_maker(), first_ns)
+        self._disk.open(attached.file_maker(self._files), first_ns)
         for block in blocks:
             self._write(block)
         self._write_events(first_ns)
@@ -478,7 +493,7 @@ class Recorder:
         if self._ring is not None:
             self._ring.clear()
         if self._ring is None or self._trigger.is_recording:
-            self._disk.open(attached.file_maker(), time_ns)
+            self._disk.open(attached.file_maker(self._files), time_ns)
         self.state.selected = attached.selected
 
     def _add_event(self, event: RecordingEvent | Gap) -> None:

@@ -131,7 +131,7 @@ def _recorded(recording: FramesFile, left_out: dict[str, str]) -> Iterator[Repla
         for publisher, each in senders.items()
         if f"{each.station}/{each.port}" in interfaces
     }
-    for captured, packet, data in recording.frames():
+    for captured, packet, data in recording.frames(once=True):
         found = recording.pds_of(data)
         if found is None:
             continue

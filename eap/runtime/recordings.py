@@ -52,6 +52,7 @@ class RecordingState(msgspec.Struct, kw_only=True):
         messages: Messages or frames written.
         octets: Bytes written.
         lost: Cycles or frames that the recorder missed.
+        not_stored: Cycles that the store of ``--to`` did not take in time.
         triggers: Times at which the condition became true.
         ring_s: Seconds in memory.
         ring_is_cut: Whether the ring is shorter than wanted, for want of memory.
@@ -72,6 +73,7 @@ class RecordingState(msgspec.Struct, kw_only=True):
     messages: int = 0
     octets: int = 0
     lost: int = 0
+    not_stored: int = 0
     triggers: int = 0
     ring_s: float | None = None
     ring_is_cut: bool = False
