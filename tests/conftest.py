@@ -138,6 +138,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         "tshark": _lacks_program("tshark", package="tshark"),
         "mosquitto": _lacks_program("mosquitto", package="mosquitto")
         or _lacks_program("openssl", package="openssl"),
+        "prometheus": _lacks_program("prometheus", package="prometheus"),
     }
     for item in items:
         for marker, reason in missing.items():

@@ -71,8 +71,8 @@ from eap.config.structs import (
 )
 from eap.config.types import TypeTable, resolve_types
 from eap.config.variables import check_variables
-from eap.config.web import check_web, resolved, warn_of_pictures
-from eap.config.web_sections import WebSection
+from eap.config.web import check_web, resolved, resolved_tls, warn_of_pictures
+from eap.config.web_sections import MetricsSection, WebSection
 from eap.ids import Destination, InterfaceUri, MacAddr, NetId
 from eap.pd.address import address_text, net_id_of, source_octets
 from eap.pd.spec import (
@@ -477,6 +477,8 @@ class Plant(msgspec.Struct, frozen=True):
     """True if changes that cannot be recorded are refused."""
     web: WebSection | None = None
     """Page for browsers, with resolved paths; None without one."""
+    metrics: MetricsSection | None = None
+    """Metrics without a page, with resolved paths; None without them."""
 
 
 class PlantResult(msgspec.Struct, frozen=True):
@@ -527,6 +529,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
         derive_directory(index),
         audit_required=plant_file.access.audit is AuditMode.REQUIRED,
         web=plant_file.web and resolved(plant_file.web, path.parent),
+        metrics=plant_file.metrics and resolved_tls(plant_file.metrics, path.parent),
     )
     warnings = (
         *report.warnings,

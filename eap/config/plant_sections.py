@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from eap.config.structs import Defaults, PlantAccess, Section, StationSection, TypeSection
-from eap.config.web_sections import WebSection
+from eap.config.web_sections import MetricsSection, WebSection
 
 
 class PlantFile(Section, frozen=True, kw_only=True):
@@ -19,3 +19,4 @@ class PlantFile(Section, frozen=True, kw_only=True):
         default_factory=dict
     )
     web: WebSection | None = None
+    metrics: MetricsSection | None = None

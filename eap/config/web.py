@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from ipaddress import ip_address, ip_network
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from msgspec.structs import replace
 
@@ -24,10 +24,12 @@ from eap.config.web_sections import (
     BusPanel,
     EventsPanel,
     GraphPanel,
+    MetricsSection,
     Panel,
     PicturePanel,
     Role,
     RoutesPanel,
+    ServerSection,
     SetPanel,
     StatesPanel,
     TablePanel,
@@ -50,6 +52,8 @@ MAX_PANELS = 200
 STATE = "state"
 """State of a station as if it were one of its variables, unless it has one with this name."""
 
+ServerT = TypeVar("ServerT", WebSection, MetricsSection)
+
 _OF = "STATION/VARIABLE, with * for any text"
 _LISTEN = "ADDRESS:PORT, such as 127.0.0.1:8080 or [::1]:8080"
 _WINDOW = re.compile(r"(\d{1,6})(s|m|h)")
@@ -58,7 +62,7 @@ _HEADER = re.compile(r"[A-Za-z0-9-]+")
 
 
 class Listen(NamedTuple):
-    """Address of the page's server."""
+    """Address of a server."""
 
     host: str
     port: int
@@ -154,7 +158,7 @@ def default_pages(plant: str, stations: Iterable[str]) -> tuple[WebPage, ...]:
     return overview, *own
 
 
-def default_role(web: WebSection) -> Role | None:
+def default_role(web: ServerSection) -> Role | None:
     """Return the role of browsers without a user; None if they have to log in.
 
     Programs of this host may do everything by ADS, too, unless a rule denies it.
@@ -165,6 +169,16 @@ def default_role(web: WebSection) -> Role | None:
     return None if has_users else Role.ENGINEER
 
 
+def resolved_tls(section: ServerT, folder: Path) -> ServerT:
+    """Return *section* with the paths of certificate and key from *folder* on."""
+    tls = section.tls and replace(
+        section.tls,
+        certificate=str((folder / section.tls.certificate).resolve()),
+        key=str((folder / section.tls.key).resolve()),
+    )
+    return replace(section, tls=tls)
+
+
 def resolved(web: WebSection, folder: Path) -> WebSection:
     """Return *web*, which has no findings, with the paths of its files from *folder* on."""
 
@@ -173,30 +187,22 @@ def resolved(web: WebSection, folder: Path) -> WebSection:
             return replace(each, file=str((folder / each.file).resolve()))
         return each
 
-    tls = web.tls and replace(
-        web.tls,
-        certificate=str((folder / web.tls.certificate).resolve()),
-        key=str((folder / web.tls.key).resolve()),
-    )
     pages = tuple(replace(page, panels=tuple(map(panel, page.panels))) for page in web.pages)
-    return replace(web, tls=tls, pages=pages)
+    return resolved_tls(replace(web, pages=pages), folder)
 
 
 def check_web(index: Index, report: FindingReport, folder: Path) -> None:
-    """Report every invalid key of ``web``; files are in *folder*."""
-    if (web := index.plant.web) is None:
+    """Report every invalid key of ``web`` and ``metrics``; files are in *folder*."""
+    web, metrics = index.plant.web, index.plant.metrics
+    if metrics is not None:
+        _check_server(metrics, report, folder)
+        if web is not None and web.listen == metrics.listen:
+            message = f"listen: {metrics.listen} is the address of the page"
+            expected = "another port, or no such key: the page gives metrics, too"
+            report.add(f"{metrics.at}.listen", message, expected)
+    if web is None:
         return
-    _check_listen(web, report)
-    _check_users(web, report)
-    _check_proxy(web, report)
-    for position, name in enumerate(web.hosts):
-        try:
-            parse_host(name.replace(":", " "), 80)
-        except ValueError:
-            report.add(f"{web.at}.hosts[{position}]", f"{name!r} is no name of a host", "a name")
-    if web.tls is not None:
-        check_file(f"{web.tls.at}.certificate", web.tls.certificate, report, folder)
-        check_file(f"{web.tls.at}.key", web.tls.key, report, folder)
+    _check_server(web, report, folder)
     names: dict[str, WebPage] = {}
     for page in web.pages:
         if not page.name.strip():
@@ -225,7 +231,23 @@ def warn_of_pictures(index: Index, report: FindingReport, folder: Path) -> list[
     return found
 
 
-def _check_listen(web: WebSection, report: FindingReport) -> None:
+def _check_server(section: ServerSection, report: FindingReport, folder: Path) -> None:
+    """Report every invalid key that all servers have."""
+    _check_listen(section, report)
+    _check_users(section, report)
+    _check_proxy(section, report)
+    for position, name in enumerate(section.hosts):
+        try:
+            parse_host(name.replace(":", " "), 80)
+        except ValueError:
+            at = f"{section.at}.hosts[{position}]"
+            report.add(at, f"{name!r} is no name of a host", "a name")
+    if section.tls is not None:
+        check_file(f"{section.tls.at}.certificate", section.tls.certificate, report, folder)
+        check_file(f"{section.tls.at}.key", section.tls.key, report, folder)
+
+
+def _check_listen(web: ServerSection, report: FindingReport) -> None:
     at = f"{web.at}.listen"
     try:
         listen = parse_listen(web.listen)
@@ -246,7 +268,7 @@ def _check_listen(web: WebSection, report: FindingReport) -> None:
         report.add(f"{web.at}.anonymous", message, "viewer, or no such key")
 
 
-def _check_users(web: WebSection, report: FindingReport) -> None:
+def _check_users(web: ServerSection, report: FindingReport) -> None:
     names: set[str] = set()
     for user in web.users:
         if not user.name.strip() or not user.name.isprintable() or ":" in user.name:
@@ -263,7 +285,7 @@ def _check_users(web: WebSection, report: FindingReport) -> None:
             report.add(where, f"user {user.name}: {exc}", FORM)
 
 
-def _check_proxy(web: WebSection, report: FindingReport) -> None:
+def _check_proxy(web: ServerSection, report: FindingReport) -> None:
     if (proxy := web.proxy) is None:
         return
     if not _HEADER.fullmatch(proxy.header):

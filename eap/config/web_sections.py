@@ -197,15 +197,33 @@ class WebProxy(Section, frozen=True, kw_only=True):
     networks: tuple[str, ...] = msgspec.field(name="from", default=("127.0.0.1",))
 
 
-class WebSection(Section, frozen=True, kw_only=True):
-    """Page for browsers, and its JSON API."""
+class ServerSection(Section, frozen=True, kw_only=True):
+    """Server by HTTP: its address, users and certificate."""
 
-    listen: str = "127.0.0.1:8080"
+    listen: str
     hosts: tuple[str, ...] = ()
     users: tuple[WebUser, ...] = ()
     anonymous: Role | None = None
     tls: WebTls | None = None
     proxy: WebProxy | None = None
-    pages: tuple[WebPage, ...] = ()
 
     SHORT: ClassVar[str] = "listen"
+    KEY: ClassVar[str]
+    """Key of the plant file that it is."""
+
+
+class WebSection(ServerSection, frozen=True, kw_only=True):
+    """Page for browsers, its JSON API, and metrics."""
+
+    listen: str = "127.0.0.1:8080"
+    pages: tuple[WebPage, ...] = ()
+
+    KEY: ClassVar[str] = "web"
+
+
+class MetricsSection(ServerSection, frozen=True, kw_only=True):
+    """Metrics alone."""
+
+    listen: str = "127.0.0.1:9464"
+
+    KEY: ClassVar[str] = "metrics"

@@ -13,7 +13,7 @@ from typing import Self
 import msgspec
 
 from eap.ams.spec import DirectoryStation, RoutingSpec
-from eap.config.web_sections import WebSection
+from eap.config.web_sections import MetricsSection, WebSection
 from eap.ids import decode_value, encode_value
 from eap.pd.device import DeviceState
 from eap.pd.spec import PortSpec, SpecRecord, StationSpec
@@ -162,12 +162,14 @@ class SegmentHandover(InheritedRecord, frozen=True):
 
 
 class WebHandover(InheritedRecord, frozen=True):
-    """All that the process of the page gets."""
+    """All that the process of the page, or of metrics alone, gets."""
 
     supervisor: int
     """Process id, as in Handover."""
     plant: str
-    web: WebSection
+    web: WebSection | None = None
+    metrics: MetricsSection | None = None
+    """Only if there is no *web*."""
 
 
 class EngineOptions(SpecRecord, frozen=True):

@@ -57,7 +57,7 @@ GRACE_NS = 1_000_000_000
 """Time for a process to end after SIGTERM; the whole appliance has two seconds."""
 _EXTRA_PAUSE_NS = 500_000_000
 """Shortest pause before an optional process is started again."""
-_EXTRAS = {"web": ("aiohttp", "web")}
+_EXTRAS = {"web": ("aiohttp", "web"), "metrics": ("aiohttp", "web")}
 """Of each optional process: the module that it needs, and the extra that installs it."""
 SEGMENT_GRACE_NS = 500_000_000
 """The same for simulated segments, which end after the others."""
@@ -216,9 +216,7 @@ class Supervisor:
             directory=plant.directory,
             audit_required=plant.audit_required,
         )
-        if plant.web is not None:
-            handover = WebHandover(os.getpid(), info.plant, plant.web)
-            self._extras[Child("web", "eap.web.process", self._bytecode)] = handover
+        self._extras |= _optional_processes(plant, self._bytecode)
         self._sockets = sockets
         self._common = common
         self._given = {
@@ -562,6 +560,18 @@ def make_info(plant: str, plant_file: str, stations: Sequence[StationSpec]) -> A
 
 def _process_info(child: Child) -> ProcessInfo:
     return ProcessInfo(child.pid, child.restarts, child.report, child.watch.step, child.fault)
+
+
+def _optional_processes(plant: Plant, bytecode: str) -> dict[Child, InheritedRecord]:
+    """Return the processes that the plant file asks for and the plant does not need."""
+    found: dict[Child, InheritedRecord] = {}
+    if plant.web is not None:
+        handover = WebHandover(os.getpid(), plant.name, web=plant.web)
+        found[Child("web", "eap.web.process", bytecode)] = handover
+    if plant.metrics is not None:
+        handover = WebHandover(os.getpid(), plant.name, metrics=plant.metrics)
+        found[Child("metrics", "eap.web.process", bytecode)] = handover
+    return found
 
 
 def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:

@@ -27,7 +27,7 @@ from aiohttp import web
 
 from eap.config.passwords import MAX_PASSWORD, PasswordHash
 from eap.config.web import default_role
-from eap.config.web_sections import WebSection
+from eap.config.web_sections import ServerSection
 from eap.net.limits import RateLimiter
 from eap.web.sessions import SESSION_S, LoginGuard, Principal, Sessions
 
@@ -81,12 +81,13 @@ class Guard:
     """Checks of requests and logins.
 
     Args:
-        section: The key ``web``.
+        section: The key ``web`` or ``metrics``.
         sessions: Sessions of its users.
     """
 
-    def __init__(self, section: WebSection, sessions: Sessions) -> None:
+    def __init__(self, section: ServerSection, sessions: Sessions) -> None:
         self.sessions = sessions
+        self._key = section.KEY
         self.has_logins = any(user.password for user in section.users)
         self.is_secure = section.tls is not None
         self._users = {user.name: user for user in section.users}
@@ -184,7 +185,9 @@ class Guard:
     def _refuse(self, request: web.Request) -> web.Response | None:
         if not self._is_known_host(request.host):
             name = request.host[:100]
-            return refusal(403, f"host {name!r} is unknown here: add it to hosts of the key web")
+            return refusal(
+                403, f"host {name!r} is unknown here: add it to hosts of the key {self._key}"
+            )
         if not self._take_rate(request.remote or ""):
             return refusal(429, "too many requests", **{"Retry-After": "1"})
         return None
@@ -229,7 +232,9 @@ class Guard:
             return refusal(403, f"a user in a header is not taken from {request.remote}")
         user = self._users.get(name)
         if user is None:
-            return refusal(403, f"unknown user {name[:100]!r}: add it to users of the key web")
+            return refusal(
+                403, f"unknown user {name[:100]!r}: add it to users of the key {self._key}"
+            )
         request[USER] = Principal(user.name, user.role)
         return None
 

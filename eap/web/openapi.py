@@ -101,6 +101,18 @@ DOCUMENT: dict[str, Any] = {
         "/api/v1/pages": {"get": _get("The pages and their panels.", _OBJECT)},
         "/api/v1/events": {"get": _get("The latest events.", _OBJECT)},
         "/api/v1/routes/{station}/": {"get": _get("AMS routes of a station.", _OBJECT, _STATION)},
+        "/metrics": {
+            "get": {
+                "summary": "Metrics for Prometheus.",
+                "responses": {
+                    "200": {
+                        "description": "The answer.",
+                        "content": {"application/openmetrics-text": {"schema": _TEXT}},
+                    },
+                    "default": _json(_ref("Error"), "Why."),
+                },
+            }
+        },
         "/api/v1/session": {"get": _get("User, role and token for changes.", _OBJECT)},
         "/api/v1/login": {"post": _post("Begin a session.", _ref("Login"))},
         "/api/v1/logout": {"post": _post("End the session.", _OBJECT)},

@@ -1,4 +1,4 @@
-"""The page as a process: started by the supervisor, or by hand with ``eapctl web``.
+"""The page, or metrics alone, as a process: of the supervisor, or by hand with ``eapctl web``.
 
 It only looks at the appliance by the control protocol, so it may end at any moment.
 """
@@ -15,8 +15,10 @@ import ssl
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from aiohttp import web
+
 from eap.config.web import parse_listen
-from eap.config.web_sections import WebSection
+from eap.config.web_sections import MetricsSection, WebSection
 from eap.errors import EnvironmentalError
 from eap.live.client import LiveClient
 from eap.live.view import LiveView
@@ -24,40 +26,43 @@ from eap.runtime.durable import whole_file
 from eap.runtime.handover import WebHandover
 from eap.runtime.startup import Startup
 from eap.runtime.store import plant_folder
+from eap.web.metrics import PATH, MetricsServer
 from eap.web.server import PageServer, open_listener, serving, tls_context
+from eap.web.sessions import KEY_BYTES
 
-_KEY_BYTES = 32
 _ORPHAN_S = 1.0
 
 logger = logging.getLogger(__name__)
 
 
 def main(descriptor: int, startup: Startup) -> int:
-    """Serve the page of an appliance until SIGTERM, or until its supervisor ends."""
+    """Serve page or metrics of an appliance until SIGTERM, or until its supervisor ends."""
     handover = WebHandover.from_descriptor(descriptor)
-    logging.basicConfig(format="web: %(message)s", level=logging.INFO)
-    startup.step("opening the page's port")
+    section = handover.web or handover.metrics or WebSection()
+    logging.basicConfig(format=f"{section.KEY}: %(message)s", level=logging.INFO)
+    startup.step(f"opening the port of {section.KEY}")
     try:
-        listener = open_listener(handover.web)
-        context = tls_context(handover.web)
+        listener = open_listener(section)
+        context = tls_context(section)
     except EnvironmentalError as exc:
         startup.step(str(exc))
         return 2
 
     def ready() -> None:
-        startup.finish({"url": page_url(handover.web)})
+        startup.finish({"url": page_url(section)})
 
-    run(handover.web, handover.plant, listener, context, ready=ready, parent=handover.supervisor)
+    run(section, handover.plant, listener, context, ready=ready, parent=handover.supervisor)
     return 0
 
 
-def page_url(section: WebSection) -> str:
-    """Return the address of the page for a browser of this host."""
-    return parse_listen(section.listen).url("https" if section.tls else "http")
+def page_url(section: WebSection | MetricsSection) -> str:
+    """Return the address of page or metrics for a browser of this host."""
+    url = parse_listen(section.listen).url("https" if section.tls else "http")
+    return url if isinstance(section, WebSection) else f"{url}{PATH[1:]}"
 
 
 def run(
-    section: WebSection,
+    section: WebSection | MetricsSection,
     plant: str,
     listener: socket.socket,
     context: ssl.SSLContext | None,
@@ -66,10 +71,10 @@ def run(
     remote: Mapping[str, LiveClient] = {},
     parent: int = 0,
 ) -> None:
-    """Serve a page until SIGINT or SIGTERM.
+    """Serve a page, or metrics, until SIGINT or SIGTERM.
 
     Args:
-        section: The key ``web``.
+        section: The key ``web`` or ``metrics``.
         plant: Its appliances on this host are shown; all if empty.
         listener: The listening socket.
         context: TLS settings.
@@ -78,34 +83,41 @@ def run(
         parent: Process without which it ends; 0 for none.
     """
     with listener:
-        key = session_key(plant)
-        asyncio.run(_serve(section, plant, listener, context, ready, remote, parent, key))
+        asyncio.run(_serve(section, plant, listener, context, ready, remote, parent))
 
 
 async def _serve(
-    section: WebSection,
+    section: WebSection | MetricsSection,
     plant: str,
     listener: socket.socket,
     context: ssl.SSLContext | None,
     ready: Callable[[], None],
     remote: Mapping[str, LiveClient],
     parent: int,
-    key: bytes,
 ) -> None:
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ended.set)
-    async with LiveView(plant, remote) as view:
-        server = PageServer(section, view, key)
-        async with serving(server, listener, context):
-            ready()
-            while not ended.is_set() and (not parent or os.getppid() == parent):
-                try:
-                    async with asyncio.timeout(_ORPHAN_S):
-                        await ended.wait()
-                except TimeoutError:
-                    continue
+    async with (
+        LiveView(plant, remote) as view,
+        serving(_application(section, plant, view), listener, context),
+    ):
+        ready()
+        while not ended.is_set() and (not parent or os.getppid() == parent):
+            try:
+                async with asyncio.timeout(_ORPHAN_S):
+                    await ended.wait()
+            except TimeoutError:
+                continue
+
+
+def _application(
+    section: WebSection | MetricsSection, plant: str, view: LiveView
+) -> web.Application:
+    if isinstance(section, WebSection):
+        return PageServer(section, view, session_key(plant)).application()
+    return MetricsServer(section, view).application()
 
 
 def session_key(plant: str) -> bytes:
@@ -115,13 +127,13 @@ def session_key(plant: str) -> bytes:
         if (key := _read_key(path)) is not None:
             return key
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        key = secrets.token_bytes(_KEY_BYTES)
+        key = secrets.token_bytes(KEY_BYTES)
         with whole_file(path) as file:
             os.fchmod(file.fileno(), 0o600)
             file.write(key)
     except (OSError, EnvironmentalError) as exc:
         logger.warning("sessions end with this process: %s cannot be kept: %s", path, exc)
-        return secrets.token_bytes(_KEY_BYTES)
+        return secrets.token_bytes(KEY_BYTES)
     return key
 
 
@@ -132,6 +144,6 @@ def _read_key(path: Path) -> bytes | None:
         return None
     with os.fdopen(fd, "rb") as file:
         mode = os.fstat(file.fileno()).st_mode
-        key = file.read(_KEY_BYTES + 1)
+        key = file.read(KEY_BYTES + 1)
     # Anyone who read it could make sessions of every user.
-    return key if len(key) == _KEY_BYTES and not mode & 0o077 else None
+    return key if len(key) == KEY_BYTES and not mode & 0o077 else None

@@ -15,12 +15,14 @@ from pathlib import Path
 from aiohttp import web
 
 from eap.config.web import parse_listen
-from eap.config.web_sections import WebSection
+from eap.config.web_sections import ServerSection, WebSection
 from eap.errors import EnvironmentalError
-from eap.live.view import LiveView
+from eap.live.view import LiveReport, LiveView
 from eap.web.api import API, Api
 from eap.web.feed import PlantFeed
 from eap.web.guard import MAX_BODY, Guard
+from eap.web.metrics import PATH as METRICS
+from eap.web.metrics import MetricsEndpoint
 from eap.web.sessions import Sessions
 from eap.web.sockets import Sockets
 from eap.web.topics import Topics
@@ -70,11 +72,15 @@ class PageServer:
         app = web.Application(middlewares=[self.guard.check], client_max_size=MAX_BODY)
         app.router.add_get(f"{API}/ws", self.sockets.serve)
         app.router.add_routes(self.api.routes())
+        app.router.add_get(METRICS, MetricsEndpoint(self._latest_report).answer)
         app.router.add_get("/", partial(_static, "index.html"))
         for name in sorted(each.name for each in STATIC.iterdir() if each.suffix in _TYPES):
             app.router.add_get(f"/{name}", partial(_static, name))
         app.cleanup_ctx.append(self._run)
         return app
+
+    async def _latest_report(self) -> LiveReport | None:
+        return self.feed.report
 
     def _status_changed(self) -> None:
         self.api.update_pages()
@@ -105,8 +111,8 @@ async def _static(name: str, request: web.Request) -> web.Response:
     return web.Response(body=body, content_type=kind, charset=charset, headers=headers)
 
 
-def open_listener(section: WebSection) -> socket.socket:
-    """Return the listening socket of the key ``web``.
+def open_listener(section: ServerSection) -> socket.socket:
+    """Return the listening socket of the key ``web`` or ``metrics``.
 
     Raises:
         EnvironmentalError: it cannot be opened.
@@ -119,13 +125,14 @@ def open_listener(section: WebSection) -> socket.socket:
         listener.bind(tuple(listen))
         listener.listen(128)
     except OSError as exc:
-        reason = f"web: cannot listen on {section.listen}: {exc.strerror}"
-        raise EnvironmentalError(f"{reason}; free it, or change listen of the key web") from None
+        reason = f"{section.KEY}: cannot listen on {section.listen}: {exc.strerror}"
+        advice = f"free it, or change listen of the key {section.KEY}"
+        raise EnvironmentalError(f"{reason}; {advice}") from None
     listener.setblocking(False)
     return listener
 
 
-def tls_context(section: WebSection) -> ssl.SSLContext | None:
+def tls_context(section: ServerSection) -> ssl.SSLContext | None:
     """Return the TLS settings, None without TLS.
 
     Raises:
@@ -139,17 +146,19 @@ def tls_context(section: WebSection) -> ssl.SSLContext | None:
         context.load_cert_chain(section.tls.certificate, section.tls.key, password=lambda: b"")
     except (OSError, ssl.SSLError) as exc:
         reason = exc.strerror or exc
-        raise EnvironmentalError(f"web: tls: {section.tls.certificate}: {reason}") from None
+        raise EnvironmentalError(
+            f"{section.KEY}: tls: {section.tls.certificate}: {reason}"
+        ) from None
     return context
 
 
 @asynccontextmanager
 async def serving(
-    server: PageServer, listener: socket.socket, context: ssl.SSLContext | None
+    application: web.Application, listener: socket.socket, context: ssl.SSLContext | None
 ) -> AsyncIterator[None]:
     """Serve connections of *listener* for the length of a block."""
     runner = web.AppRunner(
-        server.application(),
+        application,
         access_log=None,
         handle_signals=False,
         keepalive_timeout=_KEEPALIVE_S,

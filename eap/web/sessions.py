@@ -17,6 +17,8 @@ import msgspec
 
 from eap.config.web_sections import Role, WebUser
 
+KEY_BYTES = 32
+"""Length of the secret that signs sessions."""
 SESSION_S = 12 * 3600
 """Time for which a login holds."""
 _MAX_TOKEN = 1024
