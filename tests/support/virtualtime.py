@@ -15,7 +15,6 @@ from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from typing import Any, TypeVar
-from unittest import mock
 
 T = TypeVar("T")
 
@@ -74,21 +73,21 @@ def run_virtual(scene: Coroutine[Any, Any, T]) -> T:
 
 @contextmanager
 def _clock_of(loop: asyncio.AbstractEventLoop) -> Iterator[None]:
-    clocks = {
+    clocks: dict[Callable[[], float], Callable[[], float]] = {
         time.monotonic: loop.time,
         time.monotonic_ns: lambda: round(loop.time() * 1e9),
     }
-    patched = [
-        mock.patch.object(module, real.__name__, clock)
+    found = [
+        (module, real)
         for name, module in list(sys.modules.items())
         if name.startswith(("eap.", "tests.")) and name != __name__
-        for real, clock in clocks.items()
+        for real in clocks
         if vars(module).get(real.__name__) is real
     ]
-    for patch in patched:
-        patch.start()
+    for module, real in found:
+        setattr(module, real.__name__, clocks[real])
     try:
         yield
     finally:
-        for patch in patched:
-            patch.stop()
+        for module, real in found:
+            setattr(module, real.__name__, real)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 
@@ -23,7 +24,6 @@ from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.ams_discovery import RATES, RouteAdmin
 from tests.support.routing import station
 from tests.support.vectors import load
-from tests.support.virtualtime import run_virtual
 
 ADD_ROUTE = decode_discovery(next(iter(load("ams_discovery"))).octets)
 OWN = "10.0.0.1.2.1"
@@ -51,7 +51,7 @@ def routes(name="left", **told) -> StationRoutes:
 
 def ask(found, question=ADD_ROUTE, sender="10.0.0.5", *, is_this_host=False):
     route_admin = RouteAdmin([found], clock=lambda: 0.0)
-    return run_virtual(route_admin.handle(question, sender, is_this_host=is_this_host))
+    return asyncio.run(route_admin.handle(question, sender, is_this_host=is_this_host))
 
 
 def asked(**tags) -> Discovery:
@@ -188,7 +188,7 @@ def test_a_route_that_cannot_be_kept_is_not_added(monkeypatch, caplog):
 def test_all_stations_of_an_address_get_the_route():
     both = [routes(), routes("right")]
     taking = RouteAdmin(both).handle(ADD_ROUTE, "127.0.0.1", is_this_host=True)
-    assert run_virtual(taking) == AdsError.NONE
+    assert asyncio.run(taking) == AdsError.NONE
     assert [each.added for each in both] == [(ADDED,), (ADDED,)]
 
 
@@ -220,7 +220,7 @@ class Desk:
             self.route_admin.handle(ADD_ROUTE, sender, is_this_host=is_this_host)
             for _ in range(count)
         ]
-        return [run_virtual(each) for each in takings]
+        return [asyncio.run(each) for each in takings]
 
 
 def test_route_admin_sender_guesses_passwords_is_limited():
