@@ -64,7 +64,8 @@ class FrameRingFile(_RingFile):
     def writer(self) -> FrameRingWriter | None:
         """Map the ring and return its writer; None as long as no reader has given it room."""
         capacity = self.header.capacity
-        # A file that is shorter than it says would be a SIGBUS in the cycle.
+        # A file that is shorter than it says would be a SIGBUS in the cycle.  Mapping takes
+        # microseconds: the engine locks pages only when it touches them (realtime.py).
         if not capacity or os.fstat(self._fd).st_size < HEADER_SIZE + capacity:
             return None
         return FrameRingWriter(self.header, self._map(capacity))
