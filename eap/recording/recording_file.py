@@ -132,7 +132,12 @@ def describe(path: Path) -> RecordingInfo:
     )
 
 
+_LAST_YEAR_END_S = 253_402_300_800
+
+
 def iso_time(at_ns: int) -> str:
-    """Return Unix time as ISO 8601 in UTC with nanoseconds."""
+    """Return Unix time as ISO 8601 in UTC with nanoseconds; as a number behind the year 9999."""
+    if at_ns >= _LAST_YEAR_END_S * _NS:
+        return f"{at_ns} ns"  # of a file that is damaged: datetime has no such year
     at = datetime.fromtimestamp(at_ns // _NS, UTC)
     return f"{at:%Y-%m-%dT%H:%M:%S}.{at_ns % _NS:09}Z"

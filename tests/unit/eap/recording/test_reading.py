@@ -229,6 +229,11 @@ def test_damage_anywhere_raises_nothing_unexpected(
         assert str(exc)  # noqa: PT017  refused in words
 
 
+def test_time_that_no_calendar_has_is_a_number() -> None:
+    assert iso_time(10**21) == "1000000000000000000000 ns"
+    assert iso_time(253_402_300_799 * 10**9 + 5) == "9999-12-31T23:59:59.000000005Z"
+
+
 def test_damaged_chunk_costs_its_values_and_is_counted(tmp_path: Path) -> None:
     path = write_values(tmp_path / "a.mcap", 1000)
     chunk = ValuesFile(path)._content.chunks[3]
