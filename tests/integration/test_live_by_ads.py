@@ -216,6 +216,21 @@ def test_remote_write_and_denied_read_are_audited(plant: Appliance, folder: Plan
     assert (denied["service"], denied["allowed"]) == ("read", False)
 
 
+def test_routers_of_another_host_are_shown_and_not_changed(plant: Appliance) -> None:
+    pytest.importorskip("textual")
+    from eap.cli.routes_tui.table import RemoteRouters
+
+    routers = RemoteRouters([HOST, "127.9.44.9"])
+    found = routers.fetch("")
+    assert [(each.plant, each.routes.station) for each in found.routers] == [
+        ("remote", "open"),
+        ("remote", "viewed"),
+    ]
+    assert found.problem.startswith("127.9.44.9: ")
+    with pytest.raises(ControlError, match="open runs on another host"):
+        routers.add(found.routers[0], {})
+
+
 @pytest.mark.parametrize(
     ("host", "reason"),
     [

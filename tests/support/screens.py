@@ -9,6 +9,8 @@ from textual.app import App
 from textual.pilot import Pilot
 from textual.widgets import Input
 
+from tests.support.virtualtime import run_virtual
+
 Script = Callable[["Screen"], Awaitable[None]]
 
 
@@ -58,8 +60,10 @@ class Screen:
         return "\n".join(strip.text.rstrip() for strip in strips)
 
 
-def play(app: App[None], script: Script, size: tuple[int, int] = (80, 24)) -> None:
-    """Run *script* on *app*."""
+def play(
+    app: App[None], script: Script, size: tuple[int, int] = (80, 24), *, is_virtual: bool = False
+) -> None:
+    """Run *script* on *app*; with *is_virtual* one without threads and sockets, in no time."""
 
     async def run() -> None:
         async with app.run_test(size=size) as pilot:
@@ -67,4 +71,7 @@ def play(app: App[None], script: Script, size: tuple[int, int] = (80, 24)) -> No
             await screen.settle_screen()
             await script(screen)
 
-    asyncio.run(run())
+    if is_virtual:
+        run_virtual(run())
+    else:
+        asyncio.run(run())

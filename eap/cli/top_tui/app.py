@@ -84,7 +84,7 @@ class TopApp(App[None]):
             self.push_screen("overview")
             self._overview.tab = self._first_tab
             self._begin()
-        self._overview.call_after_refresh(self._overview.show_period, self._period_s)
+        self._overview.show_period(self._period_s)
 
     async def on_unmount(self) -> None:
         """Close the connections."""

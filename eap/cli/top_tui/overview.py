@@ -94,6 +94,7 @@ class OverviewScreen(Screen[None]):
         self.values: dict[str, object] | str = {}
         self._model = model
         self._events = events
+        self._is_complete = False
         self._is_paused = False
         self._period = ""
         self._drilled_from: str | None = None
@@ -115,15 +116,17 @@ class OverviewScreen(Screen[None]):
 
     @property
     def chosen(self) -> TopLine | None:
-        """The row that the cursor is on."""
-        return self._grid.chosen
+        """The row that the cursor is on; None before the screen is complete."""
+        return self._grid.chosen if self._is_complete else None
 
     def on_mount(self) -> None:
         """Show what is known."""
         field = self.query_one("#filter", Input)
         field.display = False
         field.value = self._model.match
+        self._is_complete = True
         self._grid.focus()
+        self.show()
 
     def on_resize(self) -> None:
         """Fit the table to the new size."""
@@ -142,7 +145,7 @@ class OverviewScreen(Screen[None]):
     def show_period(self, period_s: float) -> None:
         """Show how often the screen is refreshed."""
         self._period = f"{period_s:g} s"
-        self._show_head("")
+        self.show()
 
     def refresh_rows(self) -> None:
         """Show another report, unless the screen is paused."""
@@ -151,7 +154,8 @@ class OverviewScreen(Screen[None]):
 
     def show(self) -> None:
         """Show the model."""
-        if not self.is_mounted:
+        # Reports may come before the parts of the screen are there.
+        if not self._is_complete:
             return
         width = self.size.width - _SCROLLBAR
         minute = max((n for at, n in _MINUTE_WIDTHS.items() if self.size.width >= at), default=8)
@@ -233,9 +237,9 @@ class OverviewScreen(Screen[None]):
         if station is None:
             yield f"{row.name}: its appliance does not answer; the last figures are shown", "bold"
             return
-        spread = station["lateness_us"]
+        spread = station.get("lateness_us", {})
         cycle = f"cycle {duration(station['cycle_us'])}"
-        if spread["p99"] is not None:
+        if spread.get("p99") is not None:
             cycle += f", late by {duration(spread['p50'])} (p99 {duration(spread['p99'])})"
         yield f"{row.name}  {station['net_id']}  {cycle}", "bold"
         yield from self._model.findings_of(row.name, row.plant)

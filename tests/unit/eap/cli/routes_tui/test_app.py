@@ -14,6 +14,7 @@ from tests.support.controlstub import ControlStub
 from tests.support.fakeroutes import ISLAND, PRESS, FakeRoutes
 from tests.support.liveviews import routes_app
 from tests.support.screens import Screen, play
+from tests.support.statusdocument import document
 
 SIZE = 80, 24
 
@@ -315,3 +316,26 @@ def test_wide_screens_show_more(stub):
         assert heading[-4:] == ["Address", "Origin", "Last", "error"]
 
     run(script, (150, 30))
+
+
+@pytest.mark.parametrize("key", ["a", "e", "d"])
+def test_view_that_only_shows_refuses_changes(stub, key):
+    async def script(screen):
+        assert "started without --write" in await screen.press(key)
+        await screen.press("escape")
+
+    play(routes_app(RouterClient(None), refusal="started without --write"), script)
+    assert {method for method, _ in stub.requests} == {"routes_list"}
+
+
+def test_numbers_lead_to_the_other_views_and_back(stub, fake):
+    stub._methods = fake.table() | {"status": lambda _: document() | {"plant": "line"}}
+
+    async def script(screen):
+        await screen.pilot.press("1")
+        shown = await screen.settle_screen()
+        assert "1 Stations  2 PDs" in shown
+        await screen.pilot.press("4")
+        assert "r Routes 2" in await screen.settle_screen()
+
+    run(script)

@@ -46,7 +46,7 @@ async def refresh(screen: Screen) -> str:
 
 
 def run(script: Any, size: tuple[int, int] = (80, 24)) -> None:
-    play(top_app(plant), script, size)
+    play(top_app(plant), script, size, is_virtual=True)
 
 
 @pytest.mark.parametrize("size", [(80, 24), (160, 50), (60, 15)])
@@ -173,7 +173,7 @@ def test_appliance_that_is_gone_keeps_its_rows() -> None:
         assert "line does not answer" in shown.splitlines()[0]
         assert "line: has ended: waiting for it to run again" in shown
 
-    play(app, script)
+    play(app, script, is_virtual=True)
 
 
 def test_page_explains_every_key() -> None:
