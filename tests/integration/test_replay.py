@@ -209,3 +209,15 @@ def test_dry_run_sends_nothing_and_names_every_frame(kept: Kept, tmp_path: Path)
     assert row["destination"] == "127.9.62.2"
     assert result["sent"] == 0
     assert 60 < row["per_s"] < 110
+
+
+def test_plot_of_a_running_station_is_written(right: Appliance, tmp_path: Path) -> None:
+    picture = tmp_path / "x.svg"
+    words = ["plot", "right", "state.ticks", "state.wave", "--for", "0.3", "--out", str(picture)]
+    done = run_eapctl(right.runtime, *words)
+    assert done.returncode == 0, done.stderr
+    text = picture.read_text()
+    assert "right/state.wave" in text
+    assert ">mm</text>" in text
+    done = run_eapctl(right.runtime, "plot", "right", "state.note", "--for", "1")
+    assert (done.returncode, "no numbers among state.note" in done.stderr) == (2, True)
