@@ -389,6 +389,8 @@ def _processes(appliance: ApplianceStatus, label: str) -> RenderableType:
 def _process(name: str, processes: Sequence[Row]) -> Styled:
     """Return name, share of a core and memory of processes of one kind."""
     text = Styled(name)
+    if any(process.get("fault") for process in processes):
+        return text.append(" not running", _STYLES[Severity.WARNING])
     if not all(process["pid"] for process in processes):
         return text.append(" restarting", _BAD)
     if any(process.get("step") for process in processes):
@@ -448,7 +450,8 @@ def _processes_table(appliance: ApplianceStatus) -> TextTable:
     processes |= {f"segment {name}": process for name, process in segments.items()}
     for name, process in processes.items():
         if not process["pid"]:
-            table.add_row(name, "", Styled("restarting", style=_BAD))
+            state = "not running" if process.get("fault") else "restarting"
+            table.add_row(name, "", Styled(state, style=_BAD))
             continue
         if process.get("step"):
             table.add_row(name, str(process["pid"]), Styled("starting", style=_BAD))

@@ -39,7 +39,7 @@ class PasswordHash(NamedTuple):
         except ValueError:
             raise ValueError("the password is no hash of scrypt") from None
         is_power = n > 0 and n & (n - 1) == 0
-        if not is_power or n < _MIN_N or r < 1 or len(salt) < _MIN_SALT or len(key) != _KEY:
+        if not is_power or n < _MIN_N or r < _R or len(salt) < _MIN_SALT or len(key) != _KEY:
             raise ValueError("the password's hash is too weak")
         if not 1 <= p <= 4 or 128 * n * r > _MAX_MEMORY:
             raise ValueError("the password's hash takes too much memory or time")

@@ -119,12 +119,13 @@ def open_listener(section: ServerSection) -> socket.socket:
     """
     listen = parse_listen(section.listen)
     family = socket.AF_INET6 if ":" in listen.host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
     try:
-        listener = socket.socket(family, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(tuple(listen))
         listener.listen(128)
     except OSError as exc:
+        listener.close()
         reason = f"{section.KEY}: cannot listen on {section.listen}: {exc.strerror}"
         advice = f"free it, or change listen of the key {section.KEY}"
         raise EnvironmentalError(f"{reason}; {advice}") from None

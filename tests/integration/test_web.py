@@ -22,6 +22,11 @@ from tests.support.webplant import HASH, PASSWORD
 
 pytestmark = pytest.mark.net
 
+HIDE_AIOHTTP = """\
+import importlib.util as u
+find = u.find_spec
+u.find_spec = lambda name, *more: None if name == "aiohttp" else find(name, *more)
+"""
 URL = "http://127.9.61.9:8080"
 PLANT = f"""\
 plant: paged
@@ -291,10 +296,7 @@ def test_password_option_prints_a_line_that_works(tmp_path: Path):
 
 
 def test_missing_aiohttp_is_named_with_its_remedy(tmp_path: Path):
-    (tmp_path / "sitecustomize.py").write_text(
-        "import sys, importlib.util as u\nfind = u.find_spec\n"
-        "u.find_spec = lambda name, *more: None if name == 'aiohttp' else find(name, *more)\n"
-    )
+    (tmp_path / "sitecustomize.py").write_text(HIDE_AIOHTTP)
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
     done = subprocess.run(
         [sys.executable, "-m", "eap", "web", "config/demo.yaml"],
@@ -304,3 +306,19 @@ def test_missing_aiohttp_is_named_with_its_remedy(tmp_path: Path):
     assert done.stderr == (
         "aiohttp is not installed: the page needs it; pip install 'eap-appliance[web]'\n"
     )
+
+
+def test_plant_runs_without_aiohttp_and_status_says_how_to_install_it(
+    folder: Plants, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "sitecustomize.py").write_text(HIDE_AIOHTTP)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    text = PLANT.replace("plant: paged", "plant: bare").replace("127.9.61.1", "127.9.63.1")
+    bare = folder.run(folder.write(text.replace("127.9.61.2", "127.9.63.2"), "bare.yaml"))
+    remedy = "aiohttp is not installed: pip install 'eap-appliance[web]'"
+    wait_until(lambda: page_of(bare).get("fault") == remedy)
+    shown = bare.command("status")
+    assert "not running: aiohttp is not installed" in " ".join(shown.split())
+    assert bare.station("one")["state"] == "OP"
+    code, _, err = bare.stop()
+    assert (code, err.count("aiohttp")) == (0, 1)

@@ -44,7 +44,7 @@ def key(octets: int) -> str:
         (f"scrypt$1024$8$1${key(16)}${key(32)}", "too weak"),
         (f"scrypt$16385$8$1${key(16)}${key(32)}", "too weak"),
         (f"scrypt$-16384$8$1${key(16)}${key(32)}", "too weak"),
-        (f"scrypt$16384$0$1${key(16)}${key(32)}", "too weak"),
+        (f"scrypt$16384$7$1${key(16)}${key(32)}", "too weak"),
         (f"scrypt$16384$8$1${key(8)}${key(32)}", "too weak"),
         (f"scrypt$1048576$8$1${key(16)}${key(32)}", "too much"),
         (f"scrypt$16384$8$100${key(16)}${key(32)}", "too much"),

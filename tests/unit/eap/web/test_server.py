@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from time import monotonic
 
 import pytest
@@ -23,9 +24,12 @@ from eap.config.web_sections import (
     WebSection,
     WebTls,
 )
-from eap.web import guard, sockets
+from eap.errors import EnvironmentalError
+from eap.live.view import LiveView
+from eap.web import guard, server, sockets
+from eap.web.process import session_key
 from eap.web.sessions import FREE_FAILURES
-from tests.support.webplant import PASSWORD, USERS, Site, StubPlant, page, site
+from tests.support.webplant import KEY, PASSWORD, USERS, Site, StubPlant, page, site, stub_client
 
 pytestmark = pytest.mark.net
 
@@ -678,3 +682,74 @@ def test_tables_are_sent_once_a_second():
         assert (topic.names[100], len(topic.names[1000])) == ([], 3)
 
     play(script, WebSection(pages=(page(TablePanel(), name="All"),)))
+
+
+@asynccontextmanager
+async def silent_connections(port: int, number: int) -> AsyncIterator[list[asyncio.Task[bytes]]]:
+    """Serve on *port*, and give the reading of connections that send nothing."""
+    section = WebSection(listen=f"127.0.0.1:{port}")
+    with server.open_listener(section) as listener:
+        async with asyncio.timeout(60), LiveView(remote={"line": stub_client()}) as view:
+            page_server = server.PageServer(section, view, KEY)
+            async with server.serving(page_server.application(), listener, None):
+                opened = [await asyncio.open_connection("127.0.0.1", port) for _ in range(number)]
+                ends = [asyncio.ensure_future(reader.read()) for reader, _ in opened]
+                yield ends
+                for _, writer in opened:
+                    writer.close()
+                await asyncio.wait(ends)
+
+
+def test_connections_of_a_host_are_bounded(monkeypatch):
+    monkeypatch.setattr(server, "MAX_PER_HOST", 3)
+
+    async def script() -> None:
+        async with silent_connections(18321, 5) as ends:
+            while sum(each.done() for each in ends) < 2:
+                await asyncio.wait(
+                    [each for each in ends if not each.done()], return_when=asyncio.FIRST_COMPLETED
+                )
+            assert [each.done() for each in ends] == [False] * 3 + [True] * 2
+
+    asyncio.run(script())
+
+
+def test_silent_connections_are_closed(monkeypatch):
+    monkeypatch.setattr(server, "_KEEPALIVE_S", 0.2)
+
+    async def script() -> None:
+        async with silent_connections(18323, 3) as ends:
+            await asyncio.wait(ends)
+            assert [each.result() for each in ends] == [b""] * 3
+
+    asyncio.run(script())
+
+
+def test_port_in_use_is_named():
+    section = WebSection(listen="127.0.0.1:18322")
+    with (
+        server.open_listener(section),
+        pytest.raises(EnvironmentalError, match=r"cannot listen on 127\.0\.0\.1:18322"),
+    ):
+        server.open_listener(section)
+
+
+def test_wrong_certificate_is_named(tmp_path):
+    file = tmp_path / "page.crt"
+    file.write_text("no certificate")
+    tls = WebTls(certificate=str(file), key=str(file))
+    with pytest.raises(EnvironmentalError, match=r"web: tls: .*page\.crt"):
+        server.tls_context(WebSection(tls=tls))
+
+
+def test_session_key_is_kept_and_private(tmp_path, monkeypatch):
+    monkeypatch.setenv("EAP_STATE_DIR", str(tmp_path))
+    key = session_key("line")
+    file = tmp_path / "line" / "web.key"
+    assert (len(key), session_key("line"), file.stat().st_mode & 0o777) == (32, key, 0o600)
+    # Others may have read it, or written it.
+    file.chmod(0o644)
+    assert session_key("line") != key
+    assert file.stat().st_mode & 0o777 == 0o600
+    file.write_bytes(b"short")
+    assert len(session_key("line")) == 32
