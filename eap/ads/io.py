@@ -52,6 +52,10 @@ class IoSpace(AdsSpace):
     groups: Collection[int] = range(IndexGroup.IO_DEVICES, IndexGroup.IO_DEVICES + _MAX_ID + 1)
 
     def __init__(self, devices: Iterable[IoDevice]) -> None:
+        self.follow(devices)
+
+    def follow(self, devices: Iterable[IoDevice]) -> None:
+        """List other *devices* from now on."""
         self._devices = {device.id: device for device in devices}
 
     def read(self, group: int, offset: int, length: int) -> bytes:

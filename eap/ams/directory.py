@@ -40,6 +40,15 @@ class Directory:
 
     def __init__(self, stations: Sequence[DirectoryStation]) -> None:
         self.stations = {station.name: station for station in stations}
+        self._build()
+
+    def replace(self, station: DirectoryStation) -> None:
+        """Have other ports and slaves for a station."""
+        self.stations[station.name] = station
+        self._build()
+
+    def _build(self) -> None:
+        stations = self.stations.values()
         self._names = {
             AmsAddress(station.net_id, SYSTEM_PORT): station.name for station in stations
         }

@@ -90,8 +90,15 @@ class Router:
         self._devices[net_id] = ports
 
     def remove_device(self, net_id: NetId) -> None:
-        """Remove an own NetID; requests to it are routed as to any other from now on."""
+        """Let no service answer for *net_id* any more."""
         del self._devices[net_id]
+
+    def endpoints_of(self, transport: str) -> set[Endpoint]:
+        """Return the endpoints of the clients behind a transport."""
+        clients = {
+            each for each in self.record.connections.snapshot() if each.transport == transport
+        }
+        return clients | self._forwarder.endpoints_of(transport)
 
     def add_transport(self, transport: Transport) -> None:
         """Add *transport*; raises ValueError as :meth:`TransportTable.add`."""
@@ -100,7 +107,7 @@ class Router:
     def remove_transport(self, name: str, now_ns: int) -> list[Action]:
         """Remove a transport with its clients; reply to the requests that wait for its hops."""
         actions: list[Action] = []
-        for endpoint in self._forwarder.endpoints_of(name):
+        for endpoint in self.endpoints_of(name):
             actions += self.connection_closed(*endpoint, now_ns)
         actions += self._forwarder.hop_lost(name, None, f"{name} is there no more", now_ns)
         self._forwarder.admission.transport_removed(name)

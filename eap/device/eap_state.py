@@ -90,6 +90,10 @@ class EapStateMachine:
         dictionary.on_request = self.request
         self._show()
 
+    def withdraw(self, dictionary: EapDictionary) -> None:
+        """Show nothing in *dictionary* any more, whose port is removed."""
+        self._dictionaries.remove(dictionary)
+
     def start(self, *, has_mailbox: bool = True) -> StateResult:
         """Go from Init to PreOp, once clients can reach the dictionaries."""
         if self._device.state is DeviceState.INIT:

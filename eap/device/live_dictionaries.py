@@ -59,6 +59,12 @@ class RouterDictionary(ObjectDictionary):
     ) -> None:
         super().__init__()
         self._values = values
+        self._identity = identity
+        self.follow(station)
+
+    def follow(self, station: StationSpec) -> None:
+        """Have the objects of the present ports of *station*."""
+        self._objects.clear()
         self._names = {
             router9000.DEVICE.first + number: port.name for number, port in enumerate(station.ports)
         }
@@ -67,7 +73,7 @@ class RouterDictionary(ObjectDictionary):
         for number, port in enumerate(station.ports):
             index = router9000.DEVICE.first + number
             self.add(_make(router9000.DEVICE, index, partial(self._read_device, port.name)))
-        self._set_fixed(station, identity)
+        self._set_fixed(station)
 
     def name_of(self, index: int) -> str:
         """Return the name of the subject of the object at *index*, empty for the router itself."""
@@ -109,9 +115,9 @@ class RouterDictionary(ObjectDictionary):
             return self._values.state_of(port)
         return self._values.mac_of(port)
 
-    def _set_fixed(self, station: StationSpec, identity: DeviceIdentity) -> None:
+    def _set_fixed(self, station: StationSpec) -> None:
         fixed: dict[tuple[int, int], Any] = {
-            **identity.entries(),
+            **self._identity.entries(),
             (0xF920, 1): station.net_id,
         }
         for number, port in enumerate(station.ports):

@@ -208,30 +208,43 @@ class AddressKeeper:
 
     An address that went and came back serves its sockets again by itself.  Memberships, outgoing
     interfaces and bindings to an interface are kept by its index, which is another one then.
+
+    Args:
+        notify: Called when there is something to keep.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, notify: Callable[[], object] = int) -> None:
+        self._notify = notify
         self._indexes: dict[str, int] = {}
-        self._renewals: dict[str, list[Callable[[int], None]]] = {}
+        self._renewals: dict[str, list[tuple[socket.socket, Callable[[int], None]]]] = {}
 
     def keep_group(self, sock: socket.socket, group: str, address: str) -> None:
         """Keep *sock* in a multicast group, or at the broadcast address, at the interface."""
         if _is_multicast(group):
-            self._keep(address, lambda before: _join_again(sock, group, address, before))
+            self._keep(sock, address, lambda before: _join_again(sock, group, address, before))
         else:
             self.keep_interface(sock, address)
 
     def keep_interface(self, sock: socket.socket, address: str) -> None:
         """Keep *sock* bound to the interface."""
-        self._keep(address, lambda before: _bind_again(sock, address))
+        self._keep(sock, address, lambda before: _bind_again(sock, address))
 
     def keep_outgoing(self, sock: socket.socket, address: str) -> None:
         """Let *sock* send multicast at the interface."""
         out = socket.inet_aton(address)
         self._keep(
+            sock,
             address,
             lambda before: sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, out),
         )
+
+    def forget(self, sock: socket.socket) -> None:
+        """Keep nothing for *sock* any more, which is closed next."""
+        for address, renewals in list(self._renewals.items()):
+            renewals[:] = [each for each in renewals if each[0] is not sock]
+            if not renewals:
+                del self._renewals[address]
+                self._indexes.pop(address, None)
 
     def look(self) -> None:
         """Renew what belongs to interfaces that were made again since the last call."""
@@ -244,7 +257,7 @@ class AddressKeeper:
             if not index or index == before:
                 continue
             self._indexes[address] = index
-            for renew in renewals:
+            for _, renew in renewals:
                 try:
                     renew(before)
                 except (OSError, EnvironmentalError) as exc:
@@ -255,10 +268,11 @@ class AddressKeeper:
         """True if there is nothing to keep."""
         return not self._renewals
 
-    def _keep(self, address: str, renew: Callable[[int], None]) -> None:
+    def _keep(self, sock: socket.socket, address: str, renew: Callable[[int], None]) -> None:
         if IPv4Address(address).is_loopback:  # that interface is never deleted
             return
-        self._renewals.setdefault(address, []).append(renew)
+        self._renewals.setdefault(address, []).append((sock, renew))
+        self._notify()
 
 
 def _index_of(name: str) -> int:

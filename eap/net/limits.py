@@ -174,6 +174,10 @@ class ConnectionTable:
         self.listeners.append(listener)
         return listener
 
+    def remove_listener(self, listener: Listener) -> None:
+        """Remove a listener whose connections have ended."""
+        self.listeners.remove(listener)
+
     def admit(
         self, listener: Listener, connection: Connection, now_ns: int, *, spare_descriptors: int
     ) -> AcceptDecision:

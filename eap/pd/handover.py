@@ -33,8 +33,10 @@ from eap.pd.words import (
     TxWord,
 )
 
-_IN_FRAMES = {"net_id", "eap_sm", "length"}
-"""Fields of a port that only concern the content of its frames."""
+PORT_CONTENT = frozenset(("eap_sm", "length"))
+"""Fields of a port that concern the content of its frames alone."""
+_OF_ENGINE = PORT_CONTENT | {"net_id"}
+"""Fields that its channels in the engine do not depend on."""
 _OWN_WORDS = {
     StationWord.FUTEX,
     StationWord.ENGINE_SEQUENCE,
@@ -318,14 +320,20 @@ class PortChanges(NamedTuple):
         return bool(self.gone or self.added)
 
 
-def port_changes(old: StationSpec, new: StationSpec) -> PortChanges:
-    """Return the EAP ports that go and come from *old* to *new*."""
+def port_changes(
+    old: StationSpec, new: StationSpec, ignored: Collection[str] = _OF_ENGINE
+) -> PortChanges:
+    """Return the EAP ports that go and come from *old* to *new*.
+
+    Other values of *ignored* fields leave a port what it is, by default of those that its channels
+    in the engine do not depend on.
+    """
     before = {port.name: port for port in old.ports if port.kind is PortKind.EAP}
     after = {port.name: port for port in new.ports if port.kind is PortKind.EAP}
     changed = {
         name
         for name in before.keys() & after.keys()
-        if any(True for _ in _port_differences(before[name], after[name]))
+        if any(True for _ in _port_differences(before[name], after[name], ignored))
     }
     return PortChanges(
         tuple(port for name, port in before.items() if name not in after or name in changed),
@@ -335,13 +343,13 @@ def port_changes(old: StationSpec, new: StationSpec) -> PortChanges:
 
 def describe_port_changes(old: StationSpec, new: StationSpec) -> Iterator[str]:
     """Yield the changes of EAP ports from *old* to *new*, one line each."""
-    gone, added = port_changes(old, new)
+    gone, added = port_changes(old, new, PORT_CONTENT)
     before = {port.name: port for port in gone}
     names = {port.name for port in added}
     yield from (f"port {port.name}: removed" for port in gone if port.name not in names)
     for port in added:
         if port.name in before:
-            for what in _port_differences(before[port.name], port):
+            for what in _port_differences(before[port.name], port, PORT_CONTENT):
                 yield f"port {port.name}: {what}"
         else:
             yield f"port {port.name}: added at {port.interface}"
@@ -354,10 +362,10 @@ def needs_new_start(old: StationSpec, new: StationSpec) -> list[str]:
     return [f"station {old.name} cannot become {new.name}: restart the appliance"]
 
 
-def _port_differences(old: PortSpec, new: PortSpec) -> Iterator[str]:
+def _port_differences(old: PortSpec, new: PortSpec, ignored: Collection[str]) -> Iterator[str]:
     was = asdict(old)
     for field, value in asdict(new).items():
-        if field not in _IN_FRAMES and value != was[field]:
+        if field not in ignored and value != was[field]:
             yield f"{field} {was[field]} -> {value}"
 
 

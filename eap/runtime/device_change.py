@@ -17,11 +17,11 @@ from eap.device.configuration import (
     dump_configuration,
     load_configuration,
 )
-from eap.device.eap_dictionary import EapDictionary
+from eap.device.eap_dictionary import DeviceIdentity, EapDictionary
 from eap.device.eap_spec import fill, read_back
 from eap.device.rollout import bus_variables, kept_versions, without_alternates
 from eap.pd.device import DeviceFault
-from eap.pd.handover import describe_port_changes, needs_new_start
+from eap.pd.handover import describe_port_changes, needs_new_start, port_changes
 from eap.pd.spec import (
     GatewayAddress,
     GatewaySpec,
@@ -32,6 +32,7 @@ from eap.pd.spec import (
     VariableSpec,
 )
 from eap.runtime.bus_change import describe_bus_changes
+from eap.runtime.socket_plan import EVERY_ADDRESS
 from eap.runtime.store import Configuration
 
 
@@ -93,7 +94,7 @@ def fill_all(
                 pass
             else:
                 continue
-        fill(dictionary, None if like is None else like[name])
+        fill(dictionary, None if like is None else like.get(name))
 
 
 def make_plan(
@@ -104,10 +105,8 @@ def make_plan(
     refused = find_refusals(now, wanted)
     if refused:
         return Plan(wanted, [], [], refused, {})
-    fresh = {
-        name: EapDictionary(wanted, name, identity=each.identity)
-        for name, each in dictionaries.items()
-    }
+    identity = _identity_of(dictionaries)
+    fresh = {name: EapDictionary(wanted, name, identity=identity) for name in eap_ports(wanted)}
     try:
         fill_all(fresh, objects, dictionaries)
         # As PreOp to SafeOp would: what cannot be read back must not be stored either.
@@ -115,9 +114,16 @@ def make_plan(
     except DeviceFault as exc:
         return Plan(wanted, [], [], [str(exc)], {})
     changes = [
-        (name, change) for name, old in dictionaries.items() for change in compare(old, fresh[name])
+        (name, change)
+        for name, new in fresh.items()
+        for change in compare(dictionaries.get(name) or new.blank(), new)
     ]
     return Plan(wanted, changes, describe_rest(now, wanted), [], fresh)
+
+
+def _identity_of(dictionaries: Mapping[str, EapDictionary]) -> DeviceIdentity:
+    """Return the identity that all ports of a station have."""
+    return next((each.identity for each in dictionaries.values()), DeviceIdentity())
 
 
 def plan_rollback(
@@ -140,32 +146,20 @@ def plan_rollback(
 
 def find_refusals(old: StationSpec, new: StationSpec) -> list[str]:
     """Return the changes that a running station cannot make; any of them prevents all others."""
-    before = {port.name: port.net_id for port in old.ports if port.kind is PortKind.EAP}
-    net_ids = [("the station's router", old.net_id, new.net_id)]
-    net_ids += [
-        (f"port {port.name}", before[port.name], port.net_id)
-        for port in new.ports
-        if port.name in before
-    ]
     refused = needs_new_start(old, new)
-    refused += [f"{line}: restart the appliance" for line in describe_port_changes(old, new)]
-    was_at, is_at = _gateway_ports(old), _gateway_ports(new)
-    refused += [
-        f"port {name}: gateway.port {was_at.get(name, 0)} -> {is_at.get(name, 0)}: restart the"
-        " appliance"
-        for name in dict.fromkeys((*was_at, *is_at))
-        if was_at.get(name, 0) != is_at.get(name, 0)
-    ]
-    return refused + [
-        f"{what}: net_id {was} -> {becomes}: restart the appliance"
-        for what, was, becomes in net_ids
-        if was != becomes
-    ]
-
-
-def _gateway_ports(spec: StationSpec) -> dict[str, int]:
-    """Return the number of the socket that each gateway has to itself."""
-    return {port.name: port.gateway.port for port in spec.ports if port.gateway is not None}
+    if old.net_id != new.net_id:
+        refused.append(
+            f"the station's router: net_id {old.net_id} -> {new.net_id}: restart the appliance"
+        )
+    changes = port_changes(old, new)
+    for port in (*changes.gone, *changes.added):
+        # Its AMS sockets occupy the port numbers at every address, for all stations.
+        if port.interface.host == EVERY_ADDRESS:
+            refused.append(
+                f"port {port.name}: {port.interface} comes and goes at a start only: restart the"
+                f" appliance"
+            )
+    return refused
 
 
 def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
@@ -173,6 +167,7 @@ def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
     on_bus = bus_variables(old) | bus_variables(new)
     return [
         *kept_versions(old, new),
+        *describe_port_changes(old, new),
         *describe_bus_changes(old, new),
         *_gateway_changes(old, new),
         *_differences("source of", _source_name, old.sources, new.sources),

@@ -196,8 +196,9 @@ class BusFollower:
         """Serve the buses of *spec*, which the station runs."""
         await self._table.follow(spec, self._specs.values())
 
-    async def discard(self) -> None:
+    async def discard(self, *, is_engine_gone: bool = False) -> None:
         """Close what was opened for a specification that the station does not run."""
+        del is_engine_gone  # the lines of a bus may be opened twice
         self._table.close_unused(self._station)
 
 

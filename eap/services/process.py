@@ -21,13 +21,14 @@ from time import monotonic_ns, time
 from typing import TYPE_CHECKING, Any
 
 from eap.ams.directory import Directory
-from eap.ams.spec import RoutingSpec
+from eap.ams.spec import DirectoryPort, DirectoryStation, RoutingSpec
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.net import realtime
 from eap.net.image_file import StationImage
 from eap.pd.device import DeviceState
-from eap.pd.spec import StationSpec
+from eap.pd.handover import PortChanges
+from eap.pd.spec import PortKind, StationSpec
 from eap.pd.words import StationWord
 from eap.release import RELEASE
 from eap.runtime.drop_counters import DropCounters
@@ -35,7 +36,6 @@ from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import (
     Handover,
     PortName,
-    SocketKind,
 )
 from eap.runtime.recordings import recording_findings
 from eap.runtime.startup import Startup, Step, no_step
@@ -56,12 +56,13 @@ from eap.services.control.status import (
     take_snapshot,
 )
 from eap.services.device.image_values import ImageValues
-from eap.services.device.monitoring import SubscriberWatch, open_subscriber_probes
+from eap.services.device.monitoring import ProbeSockets, SubscriberWatch
 from eap.services.device.sources import SourcePlayer
 from eap.services.device.station_device import StationDevice
 from eap.services.device.station_keeper import EngineClient, StationEngine, StationKeeper
 from eap.services.engine_link import EngineLink
 from eap.services.limited_log import LimitedLogHandler
+from eap.services.network import Network
 from eap.services.routing.route_rows import (
     RouterView,
     interruption_findings,
@@ -75,7 +76,8 @@ from eap.services.routing.station_routes import (
     make_router,
 )
 from eap.services.routing.station_routing import StationRouting
-from eap.services.sockets import Network, open_transports
+from eap.services.socket_table import SocketFollower, SocketTable
+from eap.services.sockets import Transports
 from eap.services.supervisor_link import SupervisorLink
 from eap.services.tasks import keep_serving
 from eap.services.transports.accepting import Listeners
@@ -189,11 +191,17 @@ class StationDevices:
             name,
             StationRoutes(router, routing, store.routes),
             store.routing,
-            lambda spec: router.set_access(access_of(station, spec)),
+            lambda spec: router.set_access(access_of(self.specs[name], spec)),
             self.brokers[name],
         )
         self.routing[name].start()
         self.ads[name] = StationAds(station, device, image, router, identity)
+        keeper.on_change.append(partial(self._follow, name))
+
+    def _follow(self, name: str, spec: StationSpec) -> None:
+        """Follow another specification of a station: its NetIDs, addresses and dictionaries."""
+        self.ads[name].follow(spec)
+        self.routers[name].set_access(access_of(spec, self.routing[name].routes.spec))
 
     async def _follow_restarts(self) -> None:
         while True:
@@ -251,22 +259,27 @@ class Services:
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._stopping.set)
         link = EngineLink(socket.socket(fileno=self._handover.bus_fd))
         self._resources.callback(link.close)
-        devices = self._devices(images, link)
+        supervisor = SupervisorLink(socket.socket(fileno=self._handover.supervisor_fd))
+        self._resources.callback(supervisor.close)
+        sockets = SocketTable(self._handover, supervisor, self._link)
+        self._resources.callback(sockets.close)
+        devices = self._devices(images, link, sockets)
         self._startup.step("opening gateways and sockets")
         audit = self._audit(devices.routers)
-        buses = self._bus_table(link, devices, audit)
+        buses = self._bus_table(link, supervisor, devices, audit)
         network = Network(
-            self._handover,
+            sockets,
             devices.routers,
             {name: each.routes for name, each in devices.routing.items()},
             buses.gateways,
             self._counters,
             self._listeners,
-            self._resources,
+            self._link,
         )
-        transports = open_transports(network, self._link)
+        transports = Transports(network)
+        sockets.on_change.append(transports.follow)
         brokers = self._brokers(devices)
-        methods = self._methods(images, buses, devices, audit)
+        methods = self._methods(images, buses, devices, audit, sockets)
         remote = RemoteControl(methods.call, devices.routers)
         for name, router in devices.routers.items():
             router.add_service(router.net_id, ControlAds(name, remote))
@@ -274,15 +287,16 @@ class Services:
         server = ControlServer(
             methods, reachable, audit.write_request, announce=audit.begin_request
         )
-        watch = SubscriberWatch(images, open_subscriber_probes(self._handover, self._resources))
+        watch = self._subscriber_watch(images, sockets)
         on_sockets: list[Callable[[], Awaitable[None]]] = [
             partial(server.serve, self._listener, self._listeners),
             self._listeners.serve,
-            *(each.serve for each in (*transports, *brokers)),
+            *(each.serve for each in brokers),
             watch.run,
         ]
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(keep_serving(serve)) for serve in on_sockets]
+            tasks.append(group.create_task(transports.serve()))
             tasks += [group.create_task(each.serve()) for each in (devices, audit, self._log)]
             self._startup.finish({})
             await self._stopping.wait()
@@ -290,6 +304,7 @@ class Services:
             for task in tasks:
                 task.cancel()
         await buses.close()
+        transports.close()
 
     async def _open_image(self, station: str) -> StationImage:
         """Open one image; at the first start the engine creates it meanwhile.
@@ -308,9 +323,26 @@ class Services:
                 return image
             await asyncio.sleep(_IMAGE_PAUSE_S)
 
-    def _devices(self, images: dict[str, StationImage], link: EngineLink) -> StationDevices:
+    def _subscriber_watch(
+        self, images: Mapping[str, StationImage], sockets: SocketTable
+    ) -> SubscriberWatch:
+        probes = ProbeSockets(self._resources)
+        probes.follow(sockets.sockets, sockets.port)
+        watch = SubscriberWatch(images, probes.probes)
+
+        async def follow(spec: StationSpec, changes: PortChanges) -> None:
+            del spec, changes
+            probes.follow(sockets.sockets, sockets.port)
+            watch.follow()
+
+        sockets.on_change.append(follow)
+        return watch
+
+    def _devices(
+        self, images: dict[str, StationImage], link: EngineLink, sockets: SocketTable
+    ) -> StationDevices:
         handover = self._handover
-        engine = EngineClient(link, Path(handover.folder))
+        engine = EngineClient(link, Path(handover.folder), sockets.pass_to_engine)
         devices = StationDevices(
             handover.plant,
             handover.stations,
@@ -322,6 +354,9 @@ class Services:
             step=self._startup.step,
         )
         link.on_restart.append(devices.engine_has_restarted)
+        for name, keeper in devices.keepers.items():
+            keeper.followers.append(SocketFollower(sockets, name))
+            keeper.on_change.append(lambda spec: self._directory.replace(directory_station(spec)))
         gc.freeze()  # each collection would scan these objects, while clients wait
         return devices
 
@@ -337,6 +372,7 @@ class Services:
         buses: BusTable,
         devices: StationDevices,
         audit: Audit,
+        sockets: SocketTable,
     ) -> Methods:
         meter = ProcessMeter()
         engine = self._resources.enter_context(
@@ -369,11 +405,13 @@ class Services:
             status=SharedAnswer(status).get,
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
             deny_write=lambda station, origin: denial_of_write(devices.routers[station], origin),
-            more=self._more_methods(devices)
-            | GatewayMethods(self._handover, buses.gateways).table(),
+            more=self._more_methods(devices, sockets)
+            | GatewayMethods(sockets, buses.gateways).table(),
         )
 
-    def _more_methods(self, devices: StationDevices) -> dict[str, Callable[[dict[str, Any]], Any]]:
+    def _more_methods(
+        self, devices: StationDevices, sockets: SocketTable
+    ) -> dict[str, Callable[[dict[str, Any]], Any]]:
         views = {
             name: RouterView(router, devices.routing[name].routes)
             for name, router in devices.routers.items()
@@ -384,7 +422,7 @@ class Services:
             **DeviceMethods(devices.by_station, routers, plant_file).table(),
             **RouteMethods(views, self._directory).table(),
             **RoutingMethods(devices.routing).table(),
-            **AmsMethods(devices.routers, self._directory, self._ams_addresses()).table(),
+            **AmsMethods(devices.routers, self._directory, sockets.ams_address).table(),
         }
 
     def _audit(self, routers: Mapping[str, StationRouter]) -> Audit:
@@ -397,28 +435,41 @@ class Services:
                 router.require_record(partial(audit.begin, name))
         return audit
 
-    def _bus_table(self, link: EngineLink, devices: StationDevices, audit: Audit) -> BusTable:
+    def _bus_table(
+        self,
+        link: EngineLink,
+        supervisor: SupervisorLink,
+        devices: StationDevices,
+        audit: Audit,
+    ) -> BusTable:
         def audit_gateway(owner: PortName, gateway: MailboxGateway) -> None:
             gateway.admission.on_audit.append(partial(audit.write, owner.station))
             if self._handover.audit_required:
                 gateway.admission.before_change = partial(audit.begin, owner.station)
 
-        supervisor = SupervisorLink(socket.socket(fileno=self._handover.supervisor_fd))
-        self._resources.callback(supervisor.close)
         table = BusTable(link, self._link, supervisor, devices.routers, audit_gateway)
         table.start(self._handover.stations, self._handover.buses)
         for name, keeper in devices.keepers.items():
             keeper.followers.append(BusFollower(table, name, devices.specs))
         return table
 
-    def _ams_addresses(self) -> dict[str, str]:
-        """Return the first AMS/TCP address of each station."""
-        found: dict[str, str] = {}
-        for shared in self._handover.sockets:
-            if shared.kind is SocketKind.AMS_TCP:
-                for owner in shared.owners:
-                    found.setdefault(owner.station, shared.address)
-        return found
+
+def directory_station(spec: StationSpec) -> DirectoryStation:
+    """Return the names of a station, of its ports and of their slaves."""
+    return DirectoryStation(
+        spec.name,
+        spec.net_id,
+        tuple(
+            DirectoryPort(
+                port.name,
+                port.kind is PortKind.BUS,
+                port.net_id,
+                port.interface,
+                {slave.name: slave.station for slave in port.bus.slaves} if port.bus else {},
+            )
+            for port in spec.ports
+        ),
+    )
 
 
 def main(handover_fd: int, startup: Startup) -> int:

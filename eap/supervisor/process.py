@@ -255,9 +255,12 @@ class Supervisor:
         # At each start and not once: the station may have been reconfigured since.
         handover = with_stored_configuration(self._given[child], self._sockets)
         if child is self._services:
-            # The process before may have ended in a change, which no one goes on with.
+            # The process before may have ended in a change, which no one goes on with.  The engine
+            # may still have the sockets of that change: services closes them once it has not.
             self._sockets.serve()
-            self._sockets.keep_only((*handover.sockets, *handover.buses))
+            left = self._sockets.beyond(handover.sockets)
+            self._sockets.keep_only((*handover.sockets, *left, *handover.buses))
+            handover = replace(handover, sockets=(*handover.sockets, *left))
             descriptors = inherited_by_services(handover)
         else:
             descriptors = inherited_by_engine(handover)

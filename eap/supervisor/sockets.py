@@ -205,6 +205,11 @@ class SharedSockets(Closeable):
         """Open the buses that *stations* need beside what is open; returns and raises as fit."""
         return tuple(self._open_bus(planned) for planned in plan_buses(stations))
 
+    def beyond(self, wanted: Iterable[SharedSocket]) -> list[SharedSocket]:
+        """Return the open sockets of EAP ports and gateways that are not among *wanted*."""
+        keys = {each.key for each in wanted}
+        return [opened for key, opened in self._table.items() if key not in keys]
+
     def keep_only(self, wanted: Iterable[SharedSocket | BusSocket]) -> None:
         """Close all sockets and buses of ports but *wanted*."""
         for key in self._owned.keys() - {each.key for each in wanted}:

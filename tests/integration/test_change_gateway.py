@@ -71,9 +71,9 @@ def write(file: Path, gateway: str) -> Path:
     return file
 
 
-def product(address: int = 1001) -> int:
+def product(address: int = 1001, port: int = 34980) -> int:
     """Return the product of a slave by the gateway; 0 for an error."""
-    with wire(MILL) as udp:
+    with wire(MILL, port=port) as udp:
         kind, body = udp.talk(COE, address, PRODUCT)
     return int.from_bytes(body[6:10], "little") if kind == COE and body[2] == 0x43 else 0
 
@@ -126,11 +126,17 @@ def test_addresses_limits_and_state_follow_the_file(appliance: Appliance, file: 
     assert values["bus0.state"] == 8
 
 
-def test_what_needs_a_restart_is_named(appliance: Appliance, file: Path) -> None:
-    write(file, "{port: 34999}")
-    answer = said(appliance, "apply", str(file))
-    assert "! port bus0: gateway.port 0 -> 34999: restart the appliance" in answer
-    assert "no station changed" in answer
+def test_port_number_of_its_own_comes_and_goes(appliance: Appliance, file: Path) -> None:
+    for port in (34999, 34998):
+        write(file, f"{{port: {port}}}")
+        appliance.command("apply", str(file))
+        assert product(port=port) == OWN
+        served = appliance.command("gateway", "status", "mill", "--json")
+        assert f"{MILL}:{port}" in served
+    write(file, "{}")
+    appliance.command("apply", str(file))
+    assert product() == OWN
+    assert f"{MILL}:34998" not in appliance.command("gateway", "status", "mill", "--json")
 
 
 def test_gateway_opens_again_for_a_full_dictionary(appliance: Appliance, file: Path) -> None:

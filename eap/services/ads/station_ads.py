@@ -53,6 +53,7 @@ from eap.net.image_file import StationImage
 from eap.od.abort import SdoAbortError
 from eap.od.model import OdState
 from eap.od.profiles.router9000 import RouterLive
+from eap.pd.handover import PORT_CONTENT, port_changes
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from eap.services.ads.ads_service import AdsService, device_info
 from eap.services.ads.station_symbols import NotificationPump, StationSymbols
@@ -139,9 +140,13 @@ class LiveRouter:
         self._router = router
         self._device = device
         self._image = image
-        self._ports: Mapping[str, PortSpec] = {port.name: port for port in ports}
+        self.follow(ports)
         self._routes: tuple[Route, ...] = ()
         self._version = -1
+
+    def follow(self, ports: Sequence[PortSpec]) -> None:
+        """Have other ports from now on."""
+        self._ports: Mapping[str, PortSpec] = {port.name: port for port in ports}
 
     def number(self, key: RouterLive) -> int:
         """Return the value of *key* for the router as a whole."""
@@ -242,9 +247,13 @@ class RouterAds(AdsService):
         dictionary: RouterDictionary,
         info: AdsDeviceInfo,
     ) -> None:
-        io = IoSpace(_io_devices(station))
+        self._io = IoSpace(_io_devices(station))
         objects = ObjectSpace(dictionary, lambda: OdState.OP, ads_result)
-        super().__init__(device, info, {IO_PORT: [io], DEVICE_PORT: [objects]})
+        super().__init__(device, info, {IO_PORT: [self._io], DEVICE_PORT: [objects]})
+
+    def follow(self, station: StationSpec) -> None:
+        """List the present ports of *station*."""
+        self._io.follow(_io_devices(station))
 
     def perform(
         self, port: int, client: AdsClient, operation: Operation
@@ -362,25 +371,49 @@ class StationAds:
         router: StationRouter,
         identity: DeviceIdentity,
     ) -> None:
-        symbols = StationSymbols(image)
-        self.pump = NotificationPump(symbols, router.send_notification)
-        values = LiveRouter(router, device, image, station.ports)
-        self.dictionary = RouterDictionary(station, values, identity)
-        release = identity.software_version
-        info = device_info(station.name, release)
-        own = RouterAds(station, device, self.dictionary, info)
-        router.add_service(router.net_id, own)
-        self._drive(own, router.net_id)
-        system = SystemAds(device, info)
-        router.add_service(router.net_id, RouteQuery(router, system))
-        self._drive(system, router.net_id)
-        net_ids = {port.name: port.net_id for port in station.ports}
-        for port in device.dictionaries:
-            net_id, name = net_ids[port], f"{station.name}/{port}"
-            of_port = EapAds(device, port, symbols, device_info(name, release))
-            for service in (of_port, SystemAds(device, info)):
-                router.add_service(net_id, service)
-                self._drive(service, net_id)
+        self._station = station
+        self._device = device
+        self._router = router
+        self._release = identity.software_version
+        self._symbols = StationSymbols(image)
+        self.pump = NotificationPump(self._symbols, router.send_notification)
+        self._values = LiveRouter(router, device, image, station.ports)
+        self.dictionary = RouterDictionary(station, self._values, identity)
+        info = device_info(station.name, self._release)
+        self._own = RouterAds(station, device, self.dictionary, info)
+        router.add_service(router.net_id, self._own)
+        self._drive(self._own, router.net_id)
+        self._system = SystemAds(device, info)
+        router.add_service(router.net_id, RouteQuery(router, self._system))
+        self._drive(self._system, router.net_id)
+        for port in station.ports:
+            if port.kind is PortKind.EAP:
+                self._add(port)
+
+    def follow(self, station: StationSpec) -> None:
+        """Serve the present ports of *station*; the device has their dictionaries."""
+        changes = port_changes(self._station, station, PORT_CONTENT)
+        self._station = station
+        if not changes:
+            return
+        for port in changes.gone:
+            self.pump.remove(port.net_id)
+            self._router.remove_net_id(port.net_id)
+        self._values.follow(station.ports)
+        self.dictionary.follow(station)
+        self._own.follow(station)
+        for port in changes.added:
+            self._router.add_net_id(port.net_id)
+            self._add(port)
+
+    def _add(self, port: PortSpec) -> None:
+        name = f"{self._station.name}/{port.name}"
+        info = device_info(name, self._release)
+        of_port = EapAds(self._device, port.name, self._symbols, info)
+        system = SystemAds(self._device, device_info(self._station.name, self._release))
+        for service in (of_port, system):
+            self._router.add_service(port.net_id, service)
+            self._drive(service, port.net_id)
 
     async def serve(self) -> None:
         """Send notifications until cancelled."""

@@ -198,6 +198,10 @@ class NotificationPump:
         self._devices.append(_Device(table, net_id, port))
         table.on_add = self._wake.set
 
+    def remove(self, net_id: NetId) -> None:
+        """Drive no tables of devices behind *net_id* any more."""
+        self._devices = [device for device in self._devices if device.net_id != net_id]
+
     async def serve(self) -> None:
         """Send notifications until cancelled."""
         loop = asyncio.get_running_loop()

@@ -23,10 +23,11 @@ from eap.control.protocol import ErrorCode, of_station
 from eap.errors import ControlError, EapError
 from eap.pd.spec import PortKind, StationSpec
 from eap.runtime.engine_messages import BusReport
-from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.runtime.handover import PortName, SharedSocket, SocketKind
 from eap.services.gateway.gateway_transport import GatewayTable
 from eap.services.slaves.bus_client import BusClient, MailboxLock
 from eap.services.slaves.segment_link import SegmentLink
+from eap.services.socket_table import SocketTable
 from eap.suggest import suggest
 
 if TYPE_CHECKING:
@@ -252,12 +253,12 @@ class GatewayMethods:
     """Methods that start, stop and report gateways.
 
     Args:
-        handover: Where they are served.
+        sockets: Where they are served.
         gateways: All of them.
     """
 
-    def __init__(self, handover: Handover, gateways: GatewayTable) -> None:
-        self._handover = handover
+    def __init__(self, sockets: SocketTable, gateways: GatewayTable) -> None:
+        self._sockets = sockets
         self._table = gateways
 
     @property
@@ -290,7 +291,7 @@ class GatewayMethods:
         return self._rows(self._find(wanted))
 
     def _find(self, wanted: GatewayParameters) -> list[PortName]:
-        names = [station.name for station in self._handover.stations]
+        names = [station.name for station in self._sockets.stations]
         if wanted.station not in names:
             reason = f"unknown station {wanted.station!r}{suggest(wanted.station, names)}"
             raise ControlError(reason, code=ErrorCode.UNKNOWN_NAME)
@@ -311,7 +312,7 @@ class GatewayMethods:
         """Return the sockets behind which a gateway is."""
         first = next(each for each in self._gateways if each.station == owner.station)
         found = []
-        for shared in self._handover.sockets:
+        for shared in self._sockets.sockets:
             if shared.kind in _OWN and owner in shared.owners:
                 found.append(_place(_OWN[shared.kind], shared))
             elif shared.kind in _SHARED and first == owner:

@@ -45,18 +45,18 @@ class AmsMethods:
     Args:
         routers: By station.
         directory: Names of the plant.
-        addresses: Where each station is reached by AMS/TCP, if it is.
+        address_of: Returns where a station is reached by AMS/TCP; empty if it is not.
     """
 
     def __init__(
         self,
         routers: Mapping[str, StationRouter],
         directory: Directory,
-        addresses: Mapping[str, str],
+        address_of: Callable[[str], str],
     ) -> None:
         self._routers = routers
         self._directory = directory
-        self._addresses = addresses
+        self._address_of = address_of
 
     def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         """Return the methods by name; all have to be waited for.
@@ -75,7 +75,7 @@ class AmsMethods:
     async def _scan(self, wanted: records.ScanParameters) -> records.PlantScan:
         router = self._router(wanted.via)
         stations = await scan(router, scan_targets(self._directory, router.table))
-        via = records.ScanVia(router.name, self._addresses.get(router.name, ""))
+        via = records.ScanVia(router.name, self._address_of(router.name))
         return records.PlantScan(stations, via)
 
     async def _trace(self, wanted: records.TraceParameters) -> records.TracedPath:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import select
 import socket
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, suppress
 from ipaddress import IPv4Address
 from time import monotonic_ns
 from typing import NamedTuple, Protocol
@@ -31,8 +32,9 @@ from eap.pd.monitor import (
     SubscriberMonitor,
     SubscriberPresence,
 )
+from eap.pd.spec import PortSpec
 from eap.pd.words import FrameWord
-from eap.runtime.handover import Handover, PortName, SharedSocket, SocketKind
+from eap.runtime.handover import PortName, SharedSocket, SocketKind
 
 logger = logging.getLogger(__name__)
 
@@ -118,27 +120,62 @@ class SubscriberProbes(NamedTuple):
     udp: dict[PortName, UdpSubscriberProbe]
 
 
-def open_subscriber_probes(handover: Handover, resources: ExitStack) -> SubscriberProbes:
-    """Return the probes of all EAP ports; *resources* closes their sockets."""
-    endpoints = SubscriberProbes({}, {})
-    table = _open_table(resources)
-    for shared in handover.sockets:
-        if shared.kind is SocketKind.UDP:
-            endpoint = UdpSubscriberProbe(_both(shared), table, shared.address)
-            resources.callback(endpoint.close)
-            endpoints.udp.update(dict.fromkeys(shared.owners, endpoint))
-        elif shared.kind is SocketKind.ARP:
-            spec = handover.port(shared.owners[0])
-            sock = socket.socket(fileno=shared.services_fd)
-            hop_prober = ArpProber(
-                sock,
-                vlan_id=shared.vlan_id,
-                priority=spec.vlan_priority,
-                interface=shared.address,
-            )
-            resources.callback(hop_prober.close)
-            endpoints.arp.update(dict.fromkeys(shared.owners, hop_prober))
-    return endpoints
+class ProbeSockets:
+    """Probes of all EAP ports, which follow the ports.
+
+    Args:
+        resources: Closes them.
+
+    Attributes:
+        probes: Those of the present ports.
+    """
+
+    def __init__(self, resources: ExitStack) -> None:
+        self.probes = SubscriberProbes({}, {})
+        self._table = _open_table(resources)
+        self._udp: dict[SharedSocket, UdpSubscriberProbe] = {}
+        self._arp: dict[tuple[SharedSocket, int], ArpProber] = {}
+        resources.callback(self.close)
+
+    def follow(
+        self, sockets: Iterable[SharedSocket], port_of: Callable[[PortName], PortSpec]
+    ) -> None:
+        """Have the probes on *sockets*; *port_of* returns the specification of a port."""
+        udp: dict[SharedSocket, tuple[PortName, ...]] = {}
+        arp: dict[tuple[SharedSocket, int], tuple[PortName, ...]] = {}
+        for shared in sockets:
+            if shared.kind is SocketKind.UDP:
+                udp[shared.key] = shared.owners
+                if shared.key not in self._udp:
+                    probe = UdpSubscriberProbe(_both(shared), self._table, shared.address)
+                    self._udp[shared.key] = probe
+            elif shared.kind is SocketKind.ARP:
+                key = shared.key, port_of(shared.owners[0]).vlan_priority
+                arp[key] = shared.owners
+                if key not in self._arp:
+                    self._arp[key] = _open_prober(shared, key[1])
+        for gone in self._udp.keys() - udp.keys():
+            self._udp.pop(gone).close()
+        for left in self._arp.keys() - arp.keys():
+            self._arp.pop(left).close()
+        self.probes.udp.clear()
+        self.probes.arp.clear()
+        for socket_key, owners in udp.items():
+            self.probes.udp.update(dict.fromkeys(owners, self._udp[socket_key]))
+        for prober_key, owners in arp.items():
+            self.probes.arp.update(dict.fromkeys(owners, self._arp[prober_key]))
+
+    def close(self) -> None:
+        """Close all."""
+        for probe in self._udp.values():
+            probe.close()
+        for prober in self._arp.values():
+            prober.close()
+
+
+def _open_prober(shared: SharedSocket, priority: int) -> ArpProber:
+    sock = socket.socket(fileno=os.dup(shared.services_fd))
+    return ArpProber(sock, vlan_id=shared.vlan_id, priority=priority, interface=shared.address)
 
 
 def _open_table(resources: ExitStack) -> NeighbourTable | None:
@@ -210,6 +247,9 @@ class SubscriberWatch:
     def __init__(self, images: Mapping[str, ImageHolder], endpoints: SubscriberProbes) -> None:
         self._holders = images
         self._endpoints = endpoints
+        self._errors = select.epoll()
+        self._errors.close()
+        self._owners: dict[int, UdpSubscriberProbe] = {}
         self._images: dict[str, Image] = {}
         self._rows: dict[str, _Row] = {}
         self._monitor = SubscriberMonitor(0)
@@ -218,27 +258,40 @@ class SubscriberWatch:
     async def run(self) -> None:
         """Go on until cancelled."""
         loop = asyncio.get_running_loop()
-        owners = {
-            sock.fileno(): endpoint
-            for endpoint in self._endpoints.udp.values()
-            for sock in endpoint.sockets
-        }
-        with select.epoll() as errors:
-            for fd in owners:
-                # Errors alone, and each once: the frames that arrive there are for others.
-                errors.register(fd, select.EPOLLET)
+        with select.epoll() as self._errors:
+            self._register()
 
             def collect() -> None:
-                for fd, _ in errors.poll(0):
-                    owners[fd].collect(monotonic_ns())
+                for fd, _ in self._errors.poll(0):
+                    self._owners[fd].collect(monotonic_ns())
 
-            loop.add_reader(errors.fileno(), collect)
+            loop.add_reader(self._errors.fileno(), collect)
             try:
                 while True:
                     pause_ns = self.step(monotonic_ns()) - monotonic_ns()
                     await asyncio.sleep(max(pause_ns, 0) / 1e9)
             finally:
-                loop.remove_reader(errors.fileno())
+                loop.remove_reader(self._errors.fileno())
+
+    def follow(self) -> None:
+        """Follow the probes, of which some are new or closed."""
+        if not self._errors.closed:
+            self._register()
+        self._watch_targets()
+
+    def _register(self) -> None:
+        """Wait for the errors of all UDP sockets."""
+        for fd in self._owners:
+            with suppress(OSError):  # it is closed, and its number may be that of another socket
+                self._errors.unregister(fd)
+        self._owners = {
+            sock.fileno(): endpoint
+            for endpoint in self._endpoints.udp.values()
+            for sock in endpoint.sockets
+        }
+        for fd in self._owners:
+            # Errors alone, and each once: the frames that arrive there are for others.
+            self._errors.register(fd, select.EPOLLET)
 
     def step(self, now_ns: int) -> int:
         """Run one step; return when the next step is due."""

@@ -26,6 +26,7 @@ from eap.device.eap_state import EapStateMachine, StateResult
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import OdState
 from eap.pd.device import DeviceFault, DeviceState, FaultCode
+from eap.pd.handover import PORT_CONTENT, describe_port_changes, port_changes
 from eap.pd.spec import StationSpec
 from eap.runtime.device_change import (
     Plan,
@@ -72,6 +73,8 @@ class StationDevice:
     ) -> None:
         self.name = keeper.spec.name
         self._keeper = keeper
+        self._values = values
+        self._identity = identity
         self._draft = draft
         self._base = ""
         """Digest of the configuration that the draft begins with; empty without a draft."""
@@ -94,9 +97,7 @@ class StationDevice:
             self._confirmed_spec, _ConfirmedActions(self._confirmed_spec)
         )
         for dictionary in self.dictionaries.values():
-            self._machine.serve(dictionary)
-            dictionary.on_request = self._note_request
-            dictionary.on_change = self._note_change
+            self._serve(dictionary)
         self._machine.start()
         if keeper.state is DeviceState.PREOP:
             self._restore_draft()
@@ -106,6 +107,9 @@ class StationDevice:
             dictionary.on_download = partial(self._keep_download, name)
         if keeper.state is not DeviceState.PREOP:
             self._machine.request(keeper.state)
+        self._spec = keeper.spec
+        # First: others look for the dictionaries of the ports that are there then.
+        keeper.on_change.insert(0, self._follow_ports)
 
     @property
     def spec(self) -> StationSpec:
@@ -205,6 +209,27 @@ class StationDevice:
             return make_rollback(self.spec, self.dictionaries, self._keeper.previous, spec)
 
         return await self._jobs.run(lambda: self._change(plan, self._keeper.roll_back))
+
+    def _serve(self, dictionary: EapDictionary) -> None:
+        self._machine.serve(dictionary)
+        dictionary.on_request = self._note_request
+        dictionary.on_change = self._note_change
+
+    def _follow_ports(self, spec: StationSpec) -> None:
+        """Have a dictionary for each port of *spec*; new ones are filled by the change."""
+        changes = port_changes(self._spec, spec, PORT_CONTENT)
+        self._spec = spec
+        for port in changes.gone:
+            self._machine.withdraw(self.dictionaries.pop(port.name))
+        for port in changes.added:
+            name = port.name
+            dictionary = EapDictionary(spec, name, self._values, self._identity)
+            self.dictionaries[name] = dictionary
+            self._serve(dictionary)
+            dictionary.on_download = partial(self._keep_download, name)
+        order = [name for name in eap_ports(spec) if name in self.dictionaries]
+        for name in order:  # in the order of the ports, as after a start
+            self.dictionaries[name] = self.dictionaries.pop(name)
 
     def _plan(self, spec: StationSpec) -> Plan:
         return make_plan(self.spec, self.dictionaries, spec, {})
@@ -310,6 +335,8 @@ class StationDevice:
         spec = read_back(self.spec, self.dictionaries)
         for reason in find_refusals(self.spec, spec):
             raise DeviceFault(FaultCode.PORT, reason)
+        for change in describe_port_changes(self.spec, spec):
+            raise DeviceFault(FaultCode.PORT, f"{change}: 'eapctl apply' changes ports")
         return spec
 
     def _confirmed_spec(self) -> StationSpec:

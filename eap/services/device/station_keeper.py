@@ -38,11 +38,15 @@ class EngineClient:
     Args:
         link: Services' end of the pair with the engine.
         folder: Where both may read and write: the appliance's runtime folder.
+        pass_sockets: Passes the sockets that a specification needs to the engine.
     """
 
-    def __init__(self, link: EngineLink, folder: Path) -> None:
+    def __init__(
+        self, link: EngineLink, folder: Path, pass_sockets: Callable[[StationSpec], object]
+    ) -> None:
         self._link = link
         self._folder = folder
+        self._pass_sockets = pass_sockets
         self._numbers = itertools.count(1)
 
     async def configure(self, station: str, spec: StationSpec) -> None:
@@ -62,6 +66,8 @@ class EngineClient:
             path.unlink(missing_ok=True)
             raise EnvironmentalError(f"{path}: {exc.strerror}") from None
         try:
+            # Always: an engine that was started again may lack those of the latest change.
+            self._pass_sockets(spec)
             await self._link.request(
                 lambda number: Configure(id=number, station=station, path=str(path)), CONFIGURE_S
             )
@@ -107,8 +113,12 @@ class PortFollower(Protocol):
     async def follow(self, spec: StationSpec) -> None:
         """Use what *spec*, which the station runs, needs, and close the rest."""
 
-    async def discard(self) -> None:
-        """Close what was opened for a specification that the station does not run."""
+    async def discard(self, *, is_engine_gone: bool = False) -> None:
+        """Close what was opened for a specification that the station does not run.
+
+        With *is_engine_gone* the next engine may run it; :meth:`discard` is called again then, once
+        it does not.
+        """
 
 
 class StationKeeper:
@@ -217,7 +227,7 @@ class StationKeeper:
             self._is_engine_unknown = isinstance(exc, EngineGoneError)
             await self._save_back()
             for follower in self.followers:
-                await follower.discard()
+                await follower.discard(is_engine_gone=self._is_engine_unknown)
             raise DeviceFault(FaultCode.NOT_RUNNING, str(exc)) from None
         self._is_engine_unknown = False
         self.objects, self.previous, self._applied = record.objects, record.previous, record.applied
@@ -265,6 +275,8 @@ class StationKeeper:
             )
         else:
             self._is_engine_unknown = False
+            for follower in self.followers:
+                await follower.discard()
 
     def _record(self) -> Stored:
         return Stored(

@@ -293,7 +293,13 @@ class StationRouter:
         self._senders[transport.name] = sender
 
     def remove_transport(self, name: str) -> None:
-        """Remove a transport; requests that wait for answers by it are answered with 0x1B."""
+        """Remove a transport with its clients.
+
+        Requests that wait for answers by it are answered with 0x1B.
+        """
+        for endpoint in self._router.endpoints_of(name):
+            self._queues.forget(endpoint)
+            self._services.client_gone(endpoint)
         self._act(self._router.remove_transport(name, monotonic_ns()))
         del self._senders[name]
 

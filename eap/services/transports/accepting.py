@@ -148,7 +148,7 @@ class ListeningSocket(Generic[C]):
     """One listening socket.
 
     Args:
-        sock: The socket, which stays open.
+        sock: The socket; closed by :meth:`close`.
         name: Shown in ``status`` and the log.
         server: Serves the connections.
         listeners: All listeners of the process.
@@ -185,6 +185,11 @@ class ListeningSocket(Generic[C]):
             finally:
                 for connection in list(self._listener.connections):
                     connection.close(CloseReason.ENDED)
+
+    def close(self) -> None:
+        """Close the socket, which is not served any more."""
+        self._table.remove_listener(self._listener)
+        self._socket.close()
 
     def _accept_some(self, group: asyncio.TaskGroup) -> bool:
         """Accept waiting connections for one time slice; return False to pause."""

@@ -273,6 +273,7 @@ class AmsDiscovery:
         self._requests = requests
         self._count_dropped = count_dropped
         self._tasks = TaskSet("AMS discovery")
+        self._watched: list[socket.socket] = []
 
     def watch(self, sock: socket.socket | None = None) -> None:
         """Answer datagrams as long as the running loop lives.
@@ -281,7 +282,13 @@ class AmsDiscovery:
         """
         watched = self._sock if sock is None else sock
         watched.setblocking(False)
+        self._watched.append(watched)
         asyncio.get_running_loop().add_reader(watched.fileno(), self._drain, watched)
+
+    def stop(self) -> None:
+        """Answer no more datagrams; the sockets stay open."""
+        for sock in self._watched:
+            asyncio.get_running_loop().remove_reader(sock.fileno())
 
     async def answers_to(self, data: bytes, sender: str) -> list[bytes]:
         """Return the answers to the datagram *data*: one for each router, or none."""

@@ -70,7 +70,7 @@ class AmsTransport:
     The kernel detects a peer that vanished without FIN within a minute (TCP keep-alive).
 
     Args:
-        listener: Opened by the supervisor; it stays open.
+        listener: Opened by the supervisor; closed by :meth:`close`.
         demultiplexer: To the stations behind the listener.
         clients: All connections of the process.
         count_dropped: Counts dropped packets and connections.
@@ -94,6 +94,10 @@ class AmsTransport:
     async def serve(self) -> None:
         """Accept until cancelled; then close all connections."""
         await self._listening.serve()
+
+    def close(self) -> None:
+        """Close the listener, which is not served any more."""
+        self._listening.close()
 
     def connection_from(self, sock: socket.socket, host: str) -> AmsConnection:
         """Return the connection on an accepted socket (ConnectionServer)."""

@@ -19,16 +19,20 @@ class Demultiplexer:
     any other request to the station with the best route.  The first station gets what is left.
 
     Args:
-        behind: The stations, each with its name of the transport.
+        behind: The stations, each with its name of the transport; :meth:`follow` changes them.
     """
 
     def __init__(self, behind: Sequence[tuple[StationRouter, str]]) -> None:
         self._behind = behind
         self._fragments = Reassembly()
 
+    def follow(self, behind: Sequence[tuple[StationRouter, str]]) -> None:
+        """Distribute packets among other stations from now on."""
+        self._behind = behind
+
     def receive(self, data: bytes, connection: str, *, is_broadcast: bool = False) -> None:
         """Act on a packet; the arguments are those of :meth:`StationRouter.receive`."""
-        if len(self._behind) == 1 or is_broadcast:
+        if len(self._behind) <= 1 or is_broadcast:
             for station, transport in self._behind:
                 station.receive(data, transport, connection, is_broadcast=is_broadcast)
             return

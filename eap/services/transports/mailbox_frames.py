@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from time import monotonic_ns
 from typing import NamedTuple, Protocol, TypeAlias
 
@@ -108,6 +109,19 @@ def watch_channel(channel: DrainedChannel) -> None:
     patient = BusyPoller(channel)
     asyncio.get_running_loop().add_reader(channel.fileno(), patient.drain)
     patient.drain()
+
+
+class WithDescriptor(Protocol):
+    """Object with a descriptor."""
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+
+
+def stop_watching(channel: WithDescriptor) -> None:
+    """Drain *channel* no more, which is closed next; the loop may have ended."""
+    with suppress(RuntimeError):
+        asyncio.get_running_loop().remove_reader(channel.fileno())
 
 
 class BusyPoller:

@@ -349,12 +349,15 @@ class TcpTransport:
     engine has one for each port (:class:`eap.net.tcpport.TcpPort`).
 
     Args:
-        listener: Opened by the supervisor; it stays open.
+        listener: Opened by the supervisor; closed by :meth:`close`.
         takers: Ports that accept type 4 by TCP; may be empty.
         link: Link to the engine.
         count_dropped: Counts closed connections.
         streams: Serves the connections of type 5.
         listeners: All listeners of the process.
+
+    Attributes:
+        takers: As above; may change.
     """
 
     def __init__(
@@ -366,7 +369,7 @@ class TcpTransport:
         streams: MailboxStreams,
         listeners: Listeners,
     ) -> None:
-        self._takers = takers
+        self.takers = takers
         self._link = link
         self._count_dropped = count_dropped
         self._mailboxes = streams
@@ -379,6 +382,10 @@ class TcpTransport:
             await self._listening.serve()
         finally:
             await self._mailboxes.close()
+
+    def close(self) -> None:
+        """Close the listener, which is not served any more."""
+        self._listening.close()
 
     def connection_from(self, sock: socket.socket, host: str) -> StreamConnection:
         """Return the connection on an accepted socket (ConnectionServer)."""
@@ -406,9 +413,9 @@ class TcpTransport:
     def _dispatch(self, sock: socket.socket, host: str, frame_type: int) -> None:
         if frame_type != FrameType.PROCESS_DATA:
             reason = DropReason.WRONG_TYPE
-        elif not self._takers:
+        elif not self.takers:
             reason = DropReason.TCP_OFF
-        elif pass_connection(self._link, sock, PassedConnection(self._takers, host)):
+        elif pass_connection(self._link, sock, PassedConnection(self.takers, host)):
             return
         else:
             reason = DropReason.ENGINE_BUSY

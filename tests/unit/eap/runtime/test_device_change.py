@@ -7,6 +7,7 @@ from msgspec.structs import replace
 
 from eap.device.configuration import dump_configuration
 from eap.device.eap_dictionary import EapDictionary
+from eap.device.eap_spec import read_back
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import (
     BusPortSpec,
@@ -18,6 +19,8 @@ from eap.pd.spec import (
     PortSpec,
     RxAlternateSpec,
     SentVariableSpec,
+    TxFrameSpec,
+    TxPdSpec,
     VariableSpec,
     Writer,
 )
@@ -79,7 +82,7 @@ def test_plan_lists_all_kinds_of_changes(spec, dictionaries):
 
 
 def test_plan_lists_refused_changes(spec, dictionaries):
-    assert make_plan(spec, dictionaries, replace(spec, ports=()), {}).refused
+    assert make_plan(spec, dictionaries, replace(spec, name="other"), {}).refused
     (frame,) = spec.frames
     nowhere = replace(spec, frames=(replace(frame, pds=()),))
     plan = make_plan(spec, dictionaries, nowhere, {})
@@ -155,6 +158,11 @@ def test_plan_reports_changed_layout_with_same_version(plain):
     assert "PD 'state' (id 7) changes from 19 to 17 bytes" in line
 
 
+EVERYWHERE = PortSpec(
+    "eap1", PortKind.EAP, InterfaceUri.parse("udp://0.0.0.0"), NetId.parse("1.2.3.4.5.9")
+)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -164,17 +172,50 @@ def test_plan_reports_changed_layout_with_same_version(plain):
             "the station's router: net_id 1.1.1.1.1.1 -> 9.9.9.9.9.9",
         ),
         (
-            lambda s: with_port(s, net_id="9.9.9.9.9.9"),
-            "port eap0: net_id 1.2.3.4.5.1 -> 9.9.9.9.9.9",
+            lambda s: replace(s, ports=(*s.ports, EVERYWHERE)),
+            "port eap1: udp://0.0.0.0 comes and goes at a start only",
         ),
-        (lambda s: replace(s, ports=()), "port eap0: removed"),
-        (lambda s: with_port(s, tcp=True), "port eap0: tcp False -> True"),
     ],
 )
 def test_find_refusals_lists_changes_that_need_new_start(plain, change, words):
     (reason,) = find_refusals(plain, change(plain))
     assert reason.startswith(words)
     assert reason.endswith("restart the appliance")
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (
+            lambda s: with_port(s, net_id="9.9.9.9.9.9"),
+            "port eap0: net_id 1.2.3.4.5.1 -> 9.9.9.9.9.9",
+        ),
+        (lambda s: replace(s, ports=(), frames=()), "port eap0: removed"),
+        (lambda s: with_port(s, tcp=True), "port eap0: tcp False -> True"),
+        (
+            lambda s: replace(s, ports=(*s.ports, replace(s.ports[0], name="eap1"))),
+            "port eap1: added at udp://127.9.2.1",
+        ),
+    ],
+)
+def test_describe_rest_names_changes_of_ports(plain, change, line):
+    assert find_refusals(plain, change(plain)) == []
+    assert describe_rest(plain, change(plain)) == [line]
+
+
+def test_plan_fills_the_dictionary_of_a_new_port(plain):
+    pd = TxPdSpec("second", 9, ("running",))
+    frame = TxFrameSpec("more", "eap1", "127.9.2.2", (pd,))
+    port = replace(plain.ports[0], name="eap1", net_id=NetId.parse("1.2.3.4.5.77"))
+    wanted = replace(plain, ports=(*plain.ports, port), frames=(*plain.frames, frame))
+    dictionaries = {"eap0": EapDictionary(plain, "eap0")}
+    fill_all(dictionaries, {})
+    plan = make_plan(plain, dictionaries, wanted, {})
+    assert list(plan.dictionaries) == ["eap0", "eap1"]
+    assert {name for name, _ in plan.changes} == {"eap1"}
+    assert read_back(wanted, plan.dictionaries) == wanted
+    back = make_plan(wanted, plan.dictionaries, plain, {})
+    assert (back.changes, back.station) == ([], ["port eap1: removed"])
 
 
 def test_describe_rest_lists_sources_links_and_bus_variables(plain):

@@ -31,7 +31,7 @@ def call(method: str, **params: Any) -> Any:
         router.add_route(
             Route(NetId.parse("6.1.1.1.1.1"), "far", Endpoint("udp:none", "10.0.0.6:34980"))
         )
-        methods = AmsMethods({"island-01": router}, PLANT, {"island-01": "127.0.1.1"})
+        methods = AmsMethods({"island-01": router}, PLANT, {"island-01": "127.0.1.1"}.__getitem__)
         return msgspec.to_builtins(await methods.table()[method](params))
 
     return run_virtual(get())

@@ -225,7 +225,7 @@ def test_apply_of_the_own_plant_file_is_noted(call, stations, file, is_own):
 
 def test_refused_apply(call, stations, device):
     spec = call("export", station="left")["spec"]
-    spec["ports"][0]["tcp"] = True
+    spec["ports"][0]["interface"] = "udp://0.0.0.0"
     refused = call("apply", station="left", spec=spec)
     assert (refused["ok"], refused["results"], len(refused["refused"])) == (False, [], 1)
     device[1].failure = EngineRefusedError("no memory")

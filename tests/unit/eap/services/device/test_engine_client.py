@@ -33,6 +33,7 @@ class Engine:
     def __init__(self, answer):
         self.asked = []
         self.specs = []
+        self.passed = []
         self._answer = answer
         self._sock, self.services = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._sock.setblocking(False)
@@ -57,7 +58,7 @@ def run(answer, ask, folder):
         engine = Engine(answer)
         link = EngineLink(engine.services)
         try:
-            await ask(EngineClient(link, folder))
+            await ask(EngineClient(link, folder, engine.passed.append))
         finally:
             link.close()
             engine.close()
@@ -76,7 +77,7 @@ def refused(request):
 
 def test_a_specification_crosses_as_a_file_that_is_gone_afterwards(tmp_path):
     engine = run(done, lambda client: client.configure("left", left()), tmp_path)
-    assert engine.specs == [left()]
+    assert engine.specs == engine.passed == [left()]
     assert engine.asked[0].station == "left"
     assert list(tmp_path.iterdir()) == []
 

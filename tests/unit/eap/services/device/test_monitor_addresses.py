@@ -11,16 +11,16 @@ from eap.errors import EnvironmentalError
 from eap.ids import Destination
 from eap.net.neighbour import NeighbourTable
 from eap.pd.monitor import ProbeResult
-from eap.runtime.handover import Handover, PortName
+from eap.runtime.handover import PortName
 from eap.services.device import monitoring as monitor_ways
 from eap.services.device.monitoring import (
     REFUSAL_NS,
+    ProbeSockets,
     UdpSubscriberProbe,
     key_of,
-    open_subscriber_probes,
 )
 from eap.supervisor.sockets import SharedSockets
-from tests.unit.eap.conftest import left, right
+from tests.unit.eap.conftest import eap_port, left, right
 
 pytestmark = pytest.mark.net
 
@@ -116,14 +116,15 @@ def test_usual_port_has_no_need_to_be_named():
     assert key_of(Destination.parse("10.0.0.1")) == ("10.0.0.1", 34980)
 
 
-def handover(tmp_path, sockets):
-    stations = (left(), right())
-    return Handover(1, str(tmp_path), "p", "p.yaml", stations, sockets.fit(stations))
+def probes_of(sockets, opened, *stations):
+    probes = ProbeSockets(opened)
+    probes.follow(sockets.fit(stations), lambda name: eap_port(1))
+    return probes
 
 
 def test_every_udp_port_has_a_way(tmp_path):
     with SharedSockets(tmp_path / "control") as sockets, ExitStack() as opened:
-        endpoints = open_subscriber_probes(handover(tmp_path, sockets), opened)
+        endpoints = probes_of(sockets, opened, left(), right()).probes
         assert set(endpoints.udp) == {PortName("left", "eap0"), PortName("right", "eap0")}
         assert endpoints.arp == {}
         for endpoint in endpoints.udp.values():
@@ -137,7 +138,19 @@ def test_without_a_neighbour_table_icmp_has_to_do(tmp_path, monkeypatch, caplog,
 
     monkeypatch.setattr(monitor_ways, "NeighbourTable", refuse)
     with SharedSockets(tmp_path / "control") as sockets, ExitStack() as opened:
-        endpoints = open_subscriber_probes(handover(tmp_path, sockets), opened)
+        endpoints = probes_of(sockets, opened, left(), right()).probes
         endpoint = endpoints.udp[PortName("left", "eap0")]
         assert endpoint.evidence_of(closed, 0) is ProbeResult.BLIND
     assert "forbidden; missing subscribers on UDP are detected by ICMP only" in caplog.text
+
+
+def test_probes_follow_the_ports(tmp_path):
+    with SharedSockets(tmp_path / "control") as sockets, ExitStack() as opened:
+        made = probes_of(sockets, opened, left())
+        first = made.probes.udp[PortName("left", "eap0")]
+        made.follow(sockets.fit([left(), right()]), lambda name: eap_port(1))
+        assert made.probes.udp[PortName("left", "eap0")] is first
+        second = made.probes.udp[PortName("right", "eap0")]
+        made.follow(sockets.fit([right()]), lambda name: eap_port(1))
+        assert made.probes.udp == {PortName("right", "eap0"): second}
+        assert {sock.fileno() for sock in first.sockets} == {-1}

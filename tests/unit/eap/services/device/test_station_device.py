@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from eap.device.configuration import dump_configuration
 from eap.errors import EngineGoneError, EngineRefusedError
+from eap.ids import InterfaceUri, NetId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.profiles.eap1000 import Tx
 from eap.pd.device import DeviceState, FaultCode
@@ -313,7 +314,35 @@ def test_port_that_the_supervisor_opened_cannot_be_changed_by_downloads(spec):
         await write(device, 0xF810, 7, 1, 1)
         refused = await device.request_state(4)
         assert refused.fault.code == FaultCode.PORT
-        assert "port eap0: tcp False -> True" in refused.fault.text
+        assert "port eap0: tcp False -> True: 'eapctl apply'" in refused.fault.text
+
+    run_virtual(script())
+
+
+@pytest.mark.parametrize("state", [DeviceState.PREOP, DeviceState.OP])
+def test_apply_adds_changes_and_removes_ports(spec, state):
+    device, _ = make_device(spec, state)
+    more = replace(
+        spec, ports=(replace(spec.ports[0], name="eap1", net_id=NetId.parse("9.1.1.1.1.1")),
+                     *spec.ports),
+    )  # fmt: skip
+    changed = replace(more, ports=(replace(more.ports[0], tcp=True), *spec.ports))
+    first = device.dictionaries["eap0"]
+
+    async def script():
+        for wanted in (more, changed):
+            plan, fault = await device.apply(wanted)
+            assert (plan.refused, fault) == ([], None)
+            assert list(device.dictionaries) == ["eap1", "eap0"]
+        assert device.dictionaries["eap0"] is first
+        assert (await device.request_state(8)).fault is None
+        assert device.spec == changed
+        await device.apply(spec)
+        assert list(device.dictionaries) == ["eap0"]
+        plan, fault = await device.roll_back()
+        assert (plan.refused, fault) == ([], None)
+        assert list(device.dictionaries) == ["eap1", "eap0"]
+        assert device.spec == changed
 
     run_virtual(script())
 
@@ -364,7 +393,8 @@ def test_plan_changes_nothing(spec):
 
 def test_apply_of_an_invalid_change_changes_nothing(spec):
     device, engine = make_device(spec)
-    other_port = replace(spec, ports=(replace(spec.ports[0], tcp=True),))
+    everywhere = InterfaceUri.parse("udp://0.0.0.0")
+    other_port = replace(spec, ports=(replace(spec.ports[0], interface=everywhere),))
     (frame,) = spec.frames
     unknown = replace(spec, frames=(replace(frame, pds=(TxPdSpec("x", 1, ("ticks",) * 800),)),))
 
