@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import gc
+import importlib.util
 import itertools
 import os
 import shutil
@@ -86,6 +87,12 @@ def _lacks_program(name: str, *, package: str) -> str | None:
     return None
 
 
+def _lacks_module(name: str, *, package: str) -> str | None:
+    if importlib.util.find_spec(name) is None:
+        return f"needs {name}; to install: pip install {package}"
+    return None
+
+
 def _enter_own_network() -> bool:
     """Give this worker a network namespace of its own, where its fixed addresses are free.
 
@@ -139,6 +146,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         "mosquitto": _lacks_program("mosquitto", package="mosquitto")
         or _lacks_program("openssl", package="openssl"),
         "prometheus": _lacks_program("prometheus", package="prometheus"),
+        "chromium": _lacks_program("chromium", package="chromium")
+        or _lacks_module("playwright", package="playwright"),
     }
     for item in items:
         for marker, reason in missing.items():
