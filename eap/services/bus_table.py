@@ -1,6 +1,7 @@
 """Buses of all stations in services, which come and go while their stations run.
 
 Rule 1: the lines of a bus are opened, and passed to the engine, before a station is to use them.
+They are passed with each change: an engine that was started again may lack those of the latest one.
 Rule 2: a bus that the engine no longer runs is closed here first, then by the supervisor.
 """
 
@@ -11,13 +12,12 @@ import socket
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from msgspec.structs import replace
-
+from eap.errors import ConfigError, EngineGoneError, EnvironmentalError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
 from eap.runtime.bus_change import BusOpening, opening_of
 from eap.runtime.handover import NO_DESCRIPTOR, BusSocket, PortName
 from eap.runtime.passing import pass_bus
-from eap.runtime.socket_plan import bus_of
+from eap.runtime.socket_plan import bus_of, require_own_buses
 from eap.services.engine_link import EngineLink
 from eap.services.gateway.gateway_transport import GatewayTable
 from eap.services.routing.station_router import StationRouter
@@ -73,6 +73,8 @@ class BusTable:
         self._running: dict[_BusPort, LocalBus] = {}
         self._opened: dict[_BusPort, BusSocket] = {}
         """Buses for a change that is under way."""
+        self._lines: dict[_BusPort, tuple[BusSocket, list[int]]] = {}
+        """Descriptors of the engine for all buses."""
         self._budget: SamplingBudget | None = None
 
     def start(self, stations: Iterable[StationSpec], buses: Iterable[BusSocket]) -> None:
@@ -80,8 +82,7 @@ class BusTable:
         given = {bus.key: bus for bus in buses}
         for station in stations:
             for row, port in _bus_ports(station).items():
-                # The engine may lack them: the process before may have ended in a change.
-                self._opened[row] = self._pass_on(given[row.key])
+                self._keep(row, given[row.key])
                 self._add(row, port)
         self._publish(stations)
 
@@ -93,7 +94,17 @@ class BusTable:
         """
         for row in _bus_ports(spec):
             if row not in self._running:
-                self._opened[row] = self._pass_on(await self._supervisor.open_bus(row.key))
+                self._keep(row, await self._supervisor.open_bus(row.key))
+
+    def pass_to_engine(self, spec: StationSpec) -> None:
+        """Pass the engine the lines of all buses of *spec*; those it has do no harm.
+
+        Raises:
+            EngineGoneError: it takes none.
+        """
+        for row in _bus_ports(spec):
+            if row in self._lines and not pass_bus(self._passing, *self._lines[row]):
+                raise EngineGoneError("the engine takes no lines of buses")
 
     async def follow(self, spec: StationSpec, stations: Iterable[StationSpec]) -> None:
         """Serve the buses of *spec*, which its station runs, and no others of it.
@@ -104,6 +115,7 @@ class BusTable:
         for row in self._of_station(spec.name):
             if row not in wanted:
                 await self._running.pop(row).close()
+                self._close_lines(row)
         for row, port in wanted.items():
             if row in self._running:
                 self._running[row].follow(port)
@@ -115,7 +127,8 @@ class BusTable:
     def close_unused(self, station: str) -> None:
         """Close the lines that were opened for a change of *station* and are not used."""
         for row in [each for each in self._opened if each.key.owner.station == station]:
-            _close(self._opened.pop(row))
+            _close(self._opened.pop(row).command_fd)
+            self._close_lines(row)
         self._supervisor.keep_buses(station, {row.key for row in self._of_station(station)})
 
     async def close(self) -> None:
@@ -123,20 +136,22 @@ class BusTable:
         for bus in self._running.values():
             await bus.close()
         for opened in self._opened.values():
-            _close(opened)
+            _close(opened.command_fd)
+        for row in [*self._lines]:
+            self._close_lines(row)
 
     def _of_station(self, station: str) -> list[_BusPort]:
         return [row for row in self._running if row.key.owner.station == station]
 
-    def _pass_on(self, bus: BusSocket) -> BusSocket:
-        """Pass the lines of a bus to the engine; return the bus without them."""
+    def _keep(self, row: _BusPort, bus: BusSocket) -> None:
+        """Keep the descriptors of a bus, for its services and for an engine that lacks them."""
+        self._opened[row] = bus
         lines = [fd for fd in (bus.engine_fd, bus.second_fd) if fd != NO_DESCRIPTOR]
-        try:
-            pass_bus(self._passing, bus, lines)
-        finally:
-            for fd in lines:
-                os.close(fd)
-        return replace(bus, engine_fd=NO_DESCRIPTOR, second_fd=NO_DESCRIPTOR)
+        self._lines[row] = bus, lines
+
+    def _close_lines(self, row: _BusPort) -> None:
+        for fd in self._lines.pop(row)[1]:
+            os.close(fd)
 
     def _add(self, row: _BusPort, port: PortSpec) -> None:
         # Imported here: a plant without buses starts with about 76 modules fewer.
@@ -183,13 +198,21 @@ class BusFollower:
         specs: What all stations run, by name.
     """
 
-    def __init__(self, table: BusTable, station: str, specs: Mapping[str, StationSpec]) -> None:
+    def __init__(self, table: BusTable, station: str, specs: dict[str, StationSpec]) -> None:
         self._table = table
         self._station = station
         self._specs = specs
 
     async def open(self, spec: StationSpec) -> None:
-        """Open what *spec* needs; raises as BusTable.open."""
+        """Open what *spec* needs.
+
+        Raises:
+            EnvironmentalError: a line cannot be opened, or another bus has its interface.
+        """
+        try:
+            require_own_buses((self._specs | {self._station: spec}).values())
+        except ConfigError as exc:
+            raise EnvironmentalError(str(exc)) from None
         await self._table.open(spec)
 
     async def follow(self, spec: StationSpec) -> None:
@@ -207,6 +230,6 @@ def _bus_ports(spec: StationSpec) -> dict[_BusPort, PortSpec]:
     return {_BusPort(bus_of(spec.name, port), opening_of(port)): port for port in ports}
 
 
-def _close(bus: BusSocket) -> None:
-    if bus.command_fd != NO_DESCRIPTOR:
-        os.close(bus.command_fd)
+def _close(fd: int) -> None:
+    if fd != NO_DESCRIPTOR:
+        os.close(fd)

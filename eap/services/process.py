@@ -251,6 +251,8 @@ class Services:
         self._listener = resources.enter_context(socket.socket(fileno=handover.control_fd))
         self._listeners = Listeners()
         self._stopping = asyncio.Event()
+        self._passing: list[Callable[[StationSpec], None]] = []
+        """Pass the engine descriptors that a specification needs."""
 
     async def run(self) -> None:
         """Serve until SIGTERM."""
@@ -342,7 +344,8 @@ class Services:
         self, images: dict[str, StationImage], link: EngineLink, sockets: SocketTable
     ) -> StationDevices:
         handover = self._handover
-        engine = EngineClient(link, Path(handover.folder), sockets.pass_to_engine)
+        self._passing.append(sockets.pass_to_engine)
+        engine = EngineClient(link, Path(handover.folder), self._pass_to_engine)
         devices = StationDevices(
             handover.plant,
             handover.stations,
@@ -359,6 +362,10 @@ class Services:
             keeper.on_change.append(lambda spec: self._directory.replace(directory_station(spec)))
         gc.freeze()  # each collection would scan these objects, while clients wait
         return devices
+
+    def _pass_to_engine(self, spec: StationSpec) -> None:
+        for pass_on in self._passing:
+            pass_on(spec)
 
     def _brokers(self, devices: StationDevices) -> list[StationBrokers]:
         """Open those that are configured now, which the plant file may not have."""
@@ -449,6 +456,7 @@ class Services:
 
         table = BusTable(link, self._link, supervisor, devices.routers, audit_gateway)
         table.start(self._handover.stations, self._handover.buses)
+        self._passing.append(table.pass_to_engine)
         for name, keeper in devices.keepers.items():
             keeper.followers.append(BusFollower(table, name, devices.specs))
         return table

@@ -31,6 +31,8 @@ _Received: TypeAlias = tuple[SupervisorReply, dict[str, int]]
 
 REPLY_S = 10.0
 """Time limit of a reply: the supervisor may search for the process that holds a port."""
+BUS_REPLY_S = 30.0
+"""The same for a bus: the process of simulated slaves starts first."""
 
 
 class SupervisorLink:
@@ -68,7 +70,9 @@ class SupervisorLink:
 
         Raises as :meth:`open`, also if its slaves cannot be simulated.
         """
-        reply, found = await self.request(lambda number: OpenBus(number, wanted.key))
+        reply, found = await self.request(
+            lambda number: OpenBus(number, wanted.key), max(self._reply_s, BUS_REPLY_S)
+        )
         return replace(wanted.key, number=reply.number, **found)
 
     def keep_buses(self, station: str, buses: Iterable[BusSocket]) -> None:
@@ -81,7 +85,9 @@ class SupervisorLink:
         # If there is no room, the next services process has it closed.
         pass_descriptors(self._socket, CloseSocket(shared.key), [])
 
-    async def request(self, make: Callable[[int], SupervisorRequest]) -> _Received:
+    async def request(
+        self, make: Callable[[int], SupervisorRequest], reply_s: float | None = None
+    ) -> _Received:
         """Send the request that *make* returns for its number; return the reply.
 
         The named descriptors come with it.
@@ -95,7 +101,7 @@ class SupervisorLink:
         try:
             if not pass_descriptors(self._socket, make(number), []):
                 raise EnvironmentalError("the supervisor accepts no requests")
-            async with asyncio.timeout(self._reply_s):
+            async with asyncio.timeout(self._reply_s if reply_s is None else reply_s):
                 reply, descriptors = await future
         except TimeoutError:
             raise EnvironmentalError("the supervisor does not answer") from None

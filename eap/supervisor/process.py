@@ -31,6 +31,7 @@ from eap.pd.image import format_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, StationSpec
 from eap.pd.station import Station
+from eap.runtime.busfile import load_or_raise
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.runtime.handover import (
     NO_DESCRIPTOR,
@@ -41,7 +42,8 @@ from eap.runtime.handover import (
     SegmentHandover,
     WebHandover,
 )
-from eap.runtime.plantfile import load_plant, require_own_buses
+from eap.runtime.plantfile import load_plant
+from eap.runtime.socket_plan import require_own_buses
 from eap.runtime.startup import catch_end_signals
 from eap.runtime.store import StationStore, adopt_plant_file, effective
 from eap.suggest import suggest
@@ -592,6 +594,7 @@ def with_stored_configuration(handover: Handover, sockets: SharedSockets) -> Han
     A configuration whose sockets cannot be opened, or that no engine could ever run, is none of
     this start.
     """
+    folder = ApplianceFolder(Path(handover.folder))
     specs = []
     states = {}
     stored = effective(handover.plant, handover.stations, handover.first_state)
@@ -599,6 +602,7 @@ def with_stored_configuration(handover: Handover, sockets: SharedSockets) -> Han
         reasons = needs_new_start(given, found.spec)
         if found.spec != given:
             reasons = reasons or find_build_errors(found.spec)
+            reasons = reasons or find_missing_slaves(found.spec, folder)
         for reason in reasons:
             logger.warning("station %s: the plant file runs: %s", given.name, reason)
         specs.append(given if reasons else found.spec)
@@ -630,6 +634,23 @@ def _without_stored(
 
 def _names_of(error: UnavailableSocketError) -> list[str]:
     return [f"station {name}" for name in dict.fromkeys(each.station for each in error.owners)]
+
+
+def find_missing_slaves(spec: StationSpec, folder: ApplianceFolder) -> list[str]:
+    """Return why slaves of *spec* cannot be simulated, nothing if all can be.
+
+    The bus file may have been removed since it was applied, and the appliance started again.
+    """
+    reasons = []
+    for port in spec.ports:
+        bus = port.bus
+        if bus is None or not bus.simulated or folder.segment(bus.simulated).exists():
+            continue
+        try:
+            load_or_raise(Path(bus.file))
+        except ConfigError as exc:
+            reasons.append(f"port {port.name}: {str(exc).splitlines()[0]}")
+    return reasons
 
 
 def find_build_errors(spec: StationSpec) -> list[str]:

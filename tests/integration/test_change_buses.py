@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,8 @@ import pytest
 
 from tests.support.addresses import own_address
 from tests.support.appliance import Appliance, Plants, run_eapctl, troubles, wait_until
+from tests.support.gatewaywire import COE, wire
+from tests.support.simulator import NEAR, simulator, veth_pair
 
 pytestmark = pytest.mark.net
 
@@ -64,6 +69,7 @@ MODE = f"""{OF_DRIVE}\
             startup: [{{sdo: "0x6060", value: 1}}]
 """
 PROCESSES = ("engine", "services")
+PRODUCT = bytes.fromhex("0020 40 1810 02 00000000")
 
 
 class Works:
@@ -87,7 +93,9 @@ class Works:
         return self.eapctl("plan", str(self.file)).splitlines()
 
     def apply(self) -> str:
-        return self.eapctl("apply", str(self.file))
+        done = run_eapctl(self.appliance.runtime, "apply", str(self.file))
+        assert done.returncode == 0, (done.stdout, done.stderr, self.appliance.log())
+        return done.stdout
 
     def roll_back(self) -> str:
         return self.eapctl("rollback", str(self.file))
@@ -221,6 +229,158 @@ def test_broken_bus_file_is_refused(works: Works) -> None:
     assert "drive.yaml:3" in done.stderr
     assert works.states()["bus0.state"] == 8
     assert works.undisturbed() == before
+
+
+MILL = f"net_id: {THERE}.2.1}}\n"
+
+
+def with_bus_at_mill(interface: str, more: str = "") -> str:
+    """Return the plant with a bus at the second station."""
+    rows = (
+        f'      - {{name: bus0, kind: bus, interface: "{interface}", net_id: {THERE}.3.1{more}}}\n'
+    )
+    return PLANT.replace(MILL, MILL + rows)
+
+
+class Client(threading.Thread):
+    """Reads an object of the drive by the gateway of the first station until told to stop."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.products: list[int] = []
+        self._ending = threading.Event()
+        self.start()
+
+    def run(self) -> None:
+        with suppress(ConnectionRefusedError):  # the appliance has ended, by a failed test
+            while not self._ending.is_set():
+                self.products.append(product(HERE))
+
+    def end(self) -> set[int]:
+        self._ending.set()
+        self.join()
+        return set(self.products)
+
+
+def product(address: str, port: int = 34980) -> int:
+    """Return the product of the first slave by a gateway; 0 without an answer, or for an error."""
+    with wire(address, port=port) as udp:
+        try:
+            kind, body = udp.talk(COE, 1001, PRODUCT)
+        except TimeoutError:
+            return 0
+    return int.from_bytes(body[6:10], "little") if kind == COE and body[2] == 0x43 else 0
+
+
+def mill(works: Works) -> dict[str, Any]:
+    values = works.appliance.values("mill")
+    return {name: value for name, value in values.items() if name.startswith("bus0.")}
+
+
+def test_bus_comes_and_goes_under_load(works: Works) -> None:
+    before = works.undisturbed()
+    client = Client()
+    assert product(THERE) == 0
+    works.write(with_bus_at_mill("sim://drive.yaml"))
+    lines = works.plan()
+    assert lines[0] == "mill"
+    assert lines[1].startswith("  * bus0: added at sim://")
+    assert lines[1].endswith("drive.yaml, 1 slaves go to OP")
+    works.apply()
+    wait_until(lambda: mill(works)["bus0.state"] == 8)
+    assert product(THERE) == 0x5621
+    assert "mill/bus0/1001" in works.eapctl("scan")
+    assert works.eapctl("bus", "sdo", "read", "mill/bus0", "drive", "0x1018:2")
+    assert "mill/bus0" in works.appliance.status()["processes"]["segments"]
+    works.write(PLANT)
+    assert works.plan()[1] == "  * bus0: removed, its slaves go to INIT"
+    works.apply()
+    assert mill(works) == {}
+    assert product(THERE) == 0
+    assert "mill/bus0" not in works.eapctl("scan")
+    wait_until(lambda: "mill/bus0" not in works.appliance.status()["processes"]["segments"])
+    assert client.end() == {0x5621}
+    assert works.undisturbed() == before
+
+
+@pytest.mark.parametrize("process", PROCESSES)
+def test_added_bus_outlives_a_killed_process(works: Works, process: str) -> None:
+    works.write(with_bus_at_mill("sim://buttons.yaml"))
+    works.apply()
+    pid = works.appliance.pid(process)
+    os.kill(pid, signal.SIGKILL)
+    works.appliance.wait_for_another(process, pid)
+    wait_until(lambda: mill(works).get("bus0.state") == 8)
+    works.wait_op("bus0", "bus1")
+    assert works.plan() == ["no differences: all 2 stations are as the file says"]
+    works.roll_back()
+    assert mill(works) == {}
+
+
+def test_remote_slaves_are_in_init_when_their_bus_is_gone(works: Works) -> None:
+    interface = f"udp://{own_address(2)}"
+    with simulator(works.farm.folder / "buttons.yaml", interface):
+        works.write(with_bus_at_mill(interface, ", bus: buttons.yaml"))
+        works.apply()
+        wait_until(lambda: mill(works)["bus0.state"] == 8)
+        works.write(PLANT)
+        works.apply()
+        assert mill(works) == {}
+
+        def states() -> set[str]:
+            found = json.loads(works.eapctl("bus", "scan", "--interface", interface, "--json"))
+            return {slave["state"] for slave in found["slaves"]}
+
+        wait_until(lambda: states() == {"INIT"})
+
+
+def test_third_bus_has_a_gateway_port_of_its_own(works: Works) -> None:
+    before = works.undisturbed()
+    last = BUSES.splitlines()[-1]
+    third = last.replace("bus1", "bus2").replace(".4.1", ".5.1").replace("buttons", "drive")
+    works.write(PLANT.replace(last, f"{last}\n{third}"))
+    works.apply()
+    works.wait_op("bus2")
+    assert product(HERE, 34982) == 0x5621
+    assert f"udp://{HERE}:34982" in works.eapctl("gateway", "status")
+    works.write(PLANT)
+    works.apply()
+    with suppress(ConnectionRefusedError):
+        assert product(HERE, 34982) == 0
+    assert works.undisturbed() == before
+
+
+@pytest.mark.root
+def test_bus_at_an_ethernet_interface_comes_and_goes(farm: Plants) -> None:
+    farm.write(DRIVE, "drive.yaml")
+    bus_file = farm.write(BUTTONS, "buttons.yaml")
+    with veth_pair(), simulator(bus_file):
+        file = farm.write(PLANT)
+        appliance = farm.run(file)
+        rx = appliance.rx("mill", "state")
+        farm.write(with_bus_at_mill(f"ethernet://{NEAR}", ", bus: buttons.yaml"))
+        appliance.command("apply", str(file))
+        wait_until(lambda: appliance.values("mill")["bus0.state"] == 8)
+        appliance.command("rollback", str(file))
+        assert "bus0.state" not in appliance.values("mill")
+        found = json.loads(
+            appliance.command("bus", "scan", "--interface", f"ethernet://{NEAR}", "--json")
+        )
+        assert {slave["state"] for slave in found["slaves"]} == {"INIT"}
+        assert troubles(appliance.rx("mill", "state")) == troubles(rx)
+        assert appliance.stop()[0] == 0
+
+
+def test_bus_whose_lines_cannot_be_opened_changes_nothing(works: Works) -> None:
+    before = works.undisturbed()
+    works.write(with_bus_at_mill("ethernet://nothere"))
+    done = run_eapctl(works.appliance.runtime, "apply", str(works.file))
+    assert done.returncode
+    assert "nothere" in done.stdout + done.stderr
+    assert mill(works) == {}
+    assert works.undisturbed() == before
+    works.write(PLANT)
+    assert works.plan() == ["no differences: all 2 stations are as the file says"]
 
 
 def test_invalid_settings_change_nothing(works: Works) -> None:

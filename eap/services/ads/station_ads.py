@@ -392,10 +392,10 @@ class StationAds:
 
     def follow(self, station: StationSpec) -> None:
         """Serve the present ports of *station*; the device has their dictionaries."""
-        changes = port_changes(self._station, station, PORT_CONTENT)
-        self._station = station
-        if not changes:
+        before, self._station = self._station, station
+        if before.ports == station.ports:
             return
+        changes = port_changes(before, station, PORT_CONTENT)
         for port in changes.gone:
             self.pump.remove(port.net_id)
             self._router.remove_net_id(port.net_id)

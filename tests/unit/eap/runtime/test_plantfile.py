@@ -7,7 +7,8 @@ import pytest
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import BusPortSpec, PortKind, PortSpec, StationSpec
-from eap.runtime.plantfile import load_plant, require_own_buses
+from eap.runtime.plantfile import load_plant
+from eap.runtime.socket_plan import require_own_buses
 
 PLANT = """\
 plant: small

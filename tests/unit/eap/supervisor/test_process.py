@@ -279,6 +279,24 @@ def test_stored_configuration_that_cannot_be_built_does_not_run(caplog, sockets)
 BUS = PortSpec("bus0", PortKind.BUS, InterfaceUri.parse("sim://x.yaml"), NetId.parse("1.2.3.4.6.1"))
 
 
+@pytest.mark.net
+def test_stored_configuration_without_its_bus_file_does_not_run(tmp_path, caplog, sockets):
+    file = tmp_path / "bus.yaml"
+    file.write_text("bus: b\nslaves: [{name: a, kind: coupler}]\n")
+    bus = BusPortSpec(str(file), simulated="digest")
+    port = replace(BUS, interface=InterfaceUri("sim", str(file)), bus=bus)
+    changed = replace(left(), ports=(*left().ports, port))
+    store(changed)
+    given = replace(handover(), folder=str(tmp_path))
+    assert with_stored_configuration(given, sockets).stations[0] == changed
+    file.unlink()
+    with caplog.at_level(logging.WARNING):
+        assert with_stored_configuration(given, sockets).stations[0] == left()
+    assert "station left: the plant file runs: port bus0: " in caplog.text
+    ApplianceFolder(tmp_path).segment("digest").touch()
+    assert with_stored_configuration(given, sockets).stations[0] == changed
+
+
 def test_whatever_a_plant_file_says_can_be_built():
     for interface in ("udp://127.9.2.1", "ethernet://eth7", "tcp://127.9.2.1"):
         spec = left(eap_port(1, interface))
