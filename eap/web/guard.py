@@ -188,7 +188,7 @@ class Guard:
             return refusal(
                 403, f"host {name!r} is unknown here: add it to hosts of the key {self._key}"
             )
-        if not self._take_rate(request.remote or ""):
+        if not self._take_rate(self.host_of(request)):
             return refusal(429, "too many requests", **{"Retry-After": "1"})
         return None
 
@@ -255,7 +255,7 @@ class Guard:
         digest = hashlib.sha256(given.encode("utf-8", "replace")).digest()
         name, until_s = self._remembered.get(digest, ("", 0.0))
         if until_s < monotonic():
-            refused = await self._verify(login, password, request.remote or "")
+            refused = await self._verify(login, password, self.host_of(request))
             if refused is not None:
                 return refused
             name = login

@@ -56,7 +56,7 @@ class Sockets:
         # Browsers send cookies with a WebSocket of any site, and need no permission to read it.
         if (refused := self._guard.refuse_foreign(request)) is not None:
             return refused
-        host = request.remote or ""
+        host = self._guard.host_of(request)
         of_host = sum(1 for known, _ in self._open.values() if known == host)
         if len(self._open) >= MAX_CLIENTS or of_host >= MAX_PER_HOST:
             return refusal(503, "too many WebSockets are open")

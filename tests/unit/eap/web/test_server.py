@@ -470,6 +470,22 @@ def test_rate_of_a_host_is_limited(monkeypatch):
     play(script)
 
 
+def test_hosts_behind_a_proxy_have_rates_of_their_own(monkeypatch):
+    monkeypatch.setattr(guard, "_RATE", (2, 0.001))
+
+    async def script(found: Site) -> None:
+        client = await found.client()
+        statuses = [
+            (await client.get("/api/v1/session", headers={"X-Forwarded-For": host})).status
+            for host in ("10.0.0.1", "10.0.0.2", "10.0.0.1", "10.0.0.2", "10.0.0.1, 10.0.0.2")
+        ]
+        assert statuses == [200] * 4 + [429]
+
+    play(script, replace(CLOSED, proxy=WebProxy(header="X-Remote-User")))
+    with pytest.raises(AssertionError):  # without a proxy the header says nothing
+        play(script, CLOSED)
+
+
 def test_picture_of_a_page_has_nothing_that_runs(tmp_path):
     file = tmp_path / "line.svg"
     file.write_text(
