@@ -244,7 +244,13 @@ def plants() -> Iterator[Plants]:
         with ExitStack() as stack:
             yield Plants(folder, stack)
     finally:
-        shutil.rmtree(folder)
+        # A page's process looks for its killed supervisor once a second, and may write until then.
+        wait_until(lambda: _is_removed(folder))
+
+
+def _is_removed(folder: Path) -> bool:
+    shutil.rmtree(folder, ignore_errors=True)
+    return not folder.exists()
 
 
 def wait_until(condition: Callable[[], object], timeout_s: float = 40.0) -> float:
