@@ -71,7 +71,7 @@ def _read(plant: Path | None, listen: str | None) -> tuple[str, WebSection]:
     from msgspec.structs import replace
 
     from eap.config.web import parse_listen
-    from eap.config.web_sections import WebSection
+    from eap.config.web_sections import Role, WebSection
 
     name, section = "", WebSection()
     if plant is not None:
@@ -85,10 +85,11 @@ def _read(plant: Path | None, listen: str | None) -> tuple[str, WebSection]:
         is_loopback = parse_listen(listen).is_loopback
     except ValueError as exc:
         raise click.UsageError(f"--listen: {exc}; expected such as 127.0.0.1:8080") from None
-    if not is_loopback and (section.tls is None or not section.users):
+    is_open = section.anonymous not in {None, Role.VIEWER}
+    if not is_loopback and (section.tls is None or not section.users or is_open):
         raise ConfigError(
             f"--listen: {listen} is reached by other hosts: name a plant file whose key web has"
-            " users and tls"
+            " users and tls, and anonymous at most viewer"
         )
     return name, replace(section, listen=listen)
 
