@@ -65,3 +65,21 @@ def test_cycle_follows_the_clock_of_a_bus_with_sync0(farm: Plants):
     appliance.command("sim", "fault", "one/bus0", "power", "slave=first")
     wait_until(lambda: not lock()["is_locked"])
     assert appliance.stop()[0] == 0
+
+
+def test_cycle_follows_the_clock_after_a_changed_cycle(farm: Plants):
+    (farm.folder / "clocks.yaml").write_text(BUS)
+    file = farm.write(PLANT)
+    appliance = farm.run(file)
+
+    def lock() -> dict:
+        return appliance.station("one")["ports"][1]["bus"].get("lock", {})
+
+    wait_until(lambda: lock().get("is_locked"))
+    farm.write(PLANT.replace("cycle_us: 4000", "cycle_us: 8000"))
+    lines = appliance.command("plan", str(file)).splitlines()
+    assert "  * bus0 restarts: its slaves go to INIT, and to OP again" in lines
+    assert "  * bus0: cycle_us 4000 -> 8000" in lines
+    appliance.command("apply", str(file))
+    wait_until(lambda: lock().get("is_locked") and lock()["lead_ns"] == 2_400_000)
+    assert appliance.stop()[0] == 0
