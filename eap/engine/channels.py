@@ -108,6 +108,11 @@ class PortChannels:
         else:
             self._sockets[key] = sock
 
+    @property
+    def unused(self) -> tuple[SharedSocket, ...]:
+        """Sockets that no port has used yet."""
+        return tuple(self._sockets)
+
     def open(self, spec: StationSpec, port: PortSpec, handler: FrameHandler) -> OpenedPort:
         """Return *port* of *spec* with its channels; in effect once it is entered.
 

@@ -215,6 +215,7 @@ class _Job:
         is_built: Whether the thread has made one of them.
         is_stale: Whether it has to be built again.
         sockets: Those that the ports of the requested specification need.
+        unused: Those without a port when it began.
     """
 
     def __init__(
@@ -228,6 +229,7 @@ class _Job:
         self.is_built = False
         self.is_stale = False
         self.sockets: list[SharedSocket] = []
+        self.unused: tuple[SharedSocket, ...] = ()
         self._buses = buses
         self._before: Station | None = None
         self._taken = threading.Lock()
@@ -380,6 +382,9 @@ class StationRebuilder:
         gc.freeze()
         if not job.is_stale:
             self._channels.close_unused(job.sockets)
+            if not self._waiting:
+                # Passed for a request that never came, because services or an engine was killed.
+                self._channels.close_unused(job.unused)
             self._buses.close_unused(job.entry.station.spec.name)
             for notify in self.on_swap:
                 notify()
@@ -387,6 +392,7 @@ class StationRebuilder:
 
     def _begin(self, job: _Job) -> None:
         self._job = job
+        job.unused = self._channels.unused
         gc.collect()  # what is left is frozen afterwards, and nothing of it may be garbage
         sys.setswitchinterval(SWITCH_S)
         self._thread = threading.Thread(target=self._work, args=(job,), name="build")

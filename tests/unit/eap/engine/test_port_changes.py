@@ -209,6 +209,19 @@ def test_sockets_of_a_refused_change_are_closed(start):
     assert set(running.descriptors()) == own
 
 
+def test_socket_whose_request_never_came_is_closed_by_the_next_change(start):
+    running = start(left(), right())
+    own = set(running.descriptors())
+    for shared in running.sockets.fit([right(second(2, "udp://127.9.2.12"))]):
+        if shared.engine_fd != NO_DESCRIPTOR:
+            sock = socket.socket(fileno=os.dup(shared.engine_fd))
+            running.plant.take(sock, PassedSocket(shared.key))
+    running.sockets.keep_only(running.sockets.fit([left(), right()]))
+    assert set(running.descriptors()) > own
+    assert running.configure(left()) is None
+    assert set(running.descriptors()) == own
+
+
 def test_connection_for_a_removed_port_is_closed(start):
     two = right(eap_port(2, tcp=True))
     running = start(left(), two)
