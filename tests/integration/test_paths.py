@@ -43,7 +43,7 @@ def sender(to: str) -> str:
 
 def receiver(*froms: str) -> str:
     rows = [
-        f"      - {{name: {source}, port: eap0, from: {source}/state, timeout_ms: 500}}\n"
+        f"      - {{name: {source}, port: eap0, from: {source}/state, timeout_ms: 5000}}\n"
         for source in froms
     ]
     return "    subscribe:\n" + "".join(rows)
