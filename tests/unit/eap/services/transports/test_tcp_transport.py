@@ -101,7 +101,7 @@ def test_type_4_goes_to_the_engine_with_its_first_frame():
             assert passed.owners == OWNERS
             assert passed.host == OWN_HOST
             assert connection.recv(100) == data
-        assert scene.listeners.stats()[0].open == 0
+        await eventually(lambda: scene.listeners.stats()[0].open == 0)
         writer.close()
 
     assert play(script) == []
