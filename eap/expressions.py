@@ -61,7 +61,7 @@ class Condition:
 
     def __init__(self, text: str) -> None:
         self.text = text
-        parser = _Parser(text)
+        parser = _ConditionParser(text)
         self._evaluate = parser.parse()
         self.names = tuple(parser.names)
 
@@ -73,7 +73,7 @@ class Condition:
         return bool(self._evaluate(values))
 
 
-class _Parser:
+class _ConditionParser:
     def __init__(self, text: str) -> None:
         self._text = text
         if len(text) > MAX_LENGTH:

@@ -60,7 +60,7 @@ class _LeavingBus(NamedTuple):
     row: _RunningBus
 
 
-class StationEntry(Protocol):
+class StationBuses(Protocol):
     """A station of the engine with its buses."""
 
     station: Station
@@ -121,7 +121,7 @@ class EngineBuses:
         """Return the key of a bus that a station uses."""
         return self._running[bus].key
 
-    def make(self, entry: StationEntry, station: Station, port: PortSpec) -> EngineBus:
+    def make(self, entry: StationBuses, station: Station, port: PortSpec) -> EngineBus:
         """Return the bus at *port* of *station*, the next one of *entry*.
 
         It is in effect once it is entered.
@@ -150,7 +150,7 @@ class EngineBuses:
             entry.set_step,
         )
 
-    def open_all(self, entry: StationEntry) -> None:
+    def open_all(self, entry: StationBuses) -> None:
         """Make and enter the buses of a station that has not started yet."""
         station = entry.station
         for port in station.spec.ports:
@@ -168,7 +168,7 @@ class EngineBuses:
 
     def exchange(
         self,
-        entry: StationEntry,
+        entry: StationBuses,
         gone: Sequence[EngineBus],
         added: Mapping[str, EngineBus],
         now_ns: int,
@@ -222,7 +222,7 @@ class EngineBuses:
         if self.requests is not None:
             self.requests.close()
 
-    def _enter(self, entry: StationEntry, port: str, bus: EngineBus) -> _RunningBus:
+    def _enter(self, entry: StationBuses, port: str, bus: EngineBus) -> _RunningBus:
         spec = entry.station.spec
         key = bus_of(spec.name, next(each for each in spec.ports if each.name == port))
         row = _RunningBus(self._lines.pop(key).number, key, bus)
@@ -233,7 +233,7 @@ class EngineBuses:
             self.requests.add(row.number, bus)
         return row
 
-    def _remove(self, entry: StationEntry, bus: EngineBus, now_ns: int) -> None:
+    def _remove(self, entry: StationBuses, bus: EngineBus, now_ns: int) -> None:
         row = self._running.pop(bus)
         for port in [name for name, each in entry.buses.items() if each is bus]:
             del entry.buses[port]

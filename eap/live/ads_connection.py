@@ -57,7 +57,7 @@ from eap.control.protocol import (
 )
 from eap.errors import CodecError, ControlError
 from eap.ids import NetId
-from eap.live.transport import Subscription, gone
+from eap.live.transport import ValuesSubscription, gone
 from eap.ops.client import checked
 from eap.services.tasks import TaskSet
 
@@ -93,7 +93,7 @@ class RemoteHost(NamedTuple):
 
 
 class AdsConnection:
-    """The appliance of a remote station (ControlConnection).
+    """The appliance of a remote station (PlantConnection).
 
     Args:
         reader: Of a connection to a router.
@@ -157,7 +157,7 @@ class AdsConnection:
             answer += more
         return checked(decode_reply(answer)).result
 
-    async def watch(self, wanted: Subscription) -> AsyncGenerator[ValuesEvent | ControlError]:
+    async def watch(self, wanted: ValuesSubscription) -> AsyncGenerator[ValuesEvent | ControlError]:
         """Yield the values of variables, read once a period, until the connection ends."""
         last: dict[str, Any] = {}
         last_cycle: int | None = None

@@ -9,7 +9,7 @@ from typing import Any
 
 from eap.control.protocol import AnswerT, ErrorCode, Method, ParametersT, ValuesEvent
 from eap.errors import ControlError
-from eap.live.transport import ControlConnection, Subscription, gone
+from eap.live.transport import PlantConnection, ValuesSubscription, gone
 
 TIMEOUT_S = 5.0
 """Time for one answer: services may be restarting."""
@@ -26,9 +26,9 @@ class LiveClient:
     A request that fails for a broken connection is not repeated; the next one connects again.
     """
 
-    def __init__(self, open_connection: Callable[[], Awaitable[ControlConnection]]) -> None:
+    def __init__(self, open_connection: Callable[[], Awaitable[PlantConnection]]) -> None:
         self._open = open_connection
-        self._connection: ControlConnection | None = None
+        self._connection: PlantConnection | None = None
         self._opening = asyncio.Lock()
 
     async def request(self, method: str, /, *, within_s: float = TIMEOUT_S, **params: Any) -> Any:
@@ -38,7 +38,7 @@ class LiveClient:
             ControlError: the appliance refused, or did not answer within *within_s*.
             BusError: a bus or a slave refused or failed.
         """
-        connection: ControlConnection | None = None
+        connection: PlantConnection | None = None
         try:
             async with asyncio.timeout(within_s):
                 connection = await self._connected()
@@ -63,7 +63,7 @@ class LiveClient:
         """Return the answer to *method*; raises as :meth:`request`."""
         return method.decode(await self.request(method.name, within_s=within_s, **params))
 
-    async def watch(self, wanted: Subscription) -> AsyncGenerator[ValuesEvent | ControlError]:
+    async def watch(self, wanted: ValuesSubscription) -> AsyncGenerator[ValuesEvent | ControlError]:
         """Yield values of variables, for as long as the caller iterates.
 
         While the appliance does not answer, and while a value cannot be read, an error is yielded
@@ -71,7 +71,7 @@ class LiveClient:
         """
         pause_s = _FIRST_PAUSE_S
         while True:
-            connection: ControlConnection | None = None
+            connection: PlantConnection | None = None
             try:
                 connection = await self._connected()
                 async with aclosing(connection.watch(wanted)) as events:
@@ -90,13 +90,13 @@ class LiveClient:
         """Close the connection; the next request opens another one."""
         await self._drop(self._connection)
 
-    async def _connected(self) -> ControlConnection:
+    async def _connected(self) -> PlantConnection:
         async with self._opening:
             if self._connection is None:
                 self._connection = await self._open()
             return self._connection
 
-    async def _drop(self, connection: ControlConnection | None) -> None:
+    async def _drop(self, connection: PlantConnection | None) -> None:
         """Close *connection*, unless another call has replaced it already."""
         if connection is None or connection is not self._connection:
             return

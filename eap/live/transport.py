@@ -27,7 +27,7 @@ from eap.ops.client import checked
 from eap.services.tasks import TaskSet
 
 
-class Subscription(msgspec.Struct, frozen=True, kw_only=True):
+class ValuesSubscription(msgspec.Struct, frozen=True, kw_only=True):
     """Variables of a station to watch.
 
     Attributes:
@@ -52,13 +52,13 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True):
         }
 
 
-class ControlConnection(Protocol):
+class PlantConnection(Protocol):
     """Open connection to one appliance; it is of no use after an error UNAVAILABLE."""
 
     async def request(self, method: str, params: dict[str, Any]) -> Any:
         """Return the result of a method; raise ControlError or BusError if it is refused."""
 
-    def watch(self, wanted: Subscription) -> AsyncGenerator[ValuesEvent | ControlError]:
+    def watch(self, wanted: ValuesSubscription) -> AsyncGenerator[ValuesEvent | ControlError]:
         """Yield the values of variables until the connection ends.
 
         A value that cannot be read now is an error that is yielded.  A slow consumer gets fewer
@@ -75,7 +75,7 @@ def gone(why: str) -> ControlError:
 
 
 class UnixConnection:
-    """The control socket of one appliance (ControlConnection).
+    """The control socket of one appliance (PlantConnection).
 
     Requests are answered in their order; several may be under way.
     """
@@ -103,7 +103,7 @@ class UnixConnection:
         """Return the result of a method; raise ControlError or BusError if it is refused."""
         return (await self._request(method, params)).result
 
-    async def watch(self, wanted: Subscription) -> AsyncGenerator[ValuesEvent | ControlError]:
+    async def watch(self, wanted: ValuesSubscription) -> AsyncGenerator[ValuesEvent | ControlError]:
         """Yield the values of variables until the connection ends."""
         reply = await self._request(SUBSCRIBE.name, wanted.params())
         number = SUBSCRIBE.decode(reply.result).subscription

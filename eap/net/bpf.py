@@ -26,7 +26,7 @@ Instruction: TypeAlias = tuple[int, int, int, int]
 """Operation, jump if true, jump if false, operand."""
 
 
-class Role(IntEnum):
+class SocketRole(IntEnum):
     """Process that a socket belongs to: its index in a group of two."""
 
     ENGINE = 0
@@ -71,8 +71,8 @@ def _by_type(offset: int, services: int, others: int) -> list[Instruction]:
     ]
 
 
-def _actions(role: Role) -> tuple[int, int]:
-    return (_ALL, 0) if role is Role.SERVICES else (0, _ALL)
+def _actions(role: SocketRole) -> tuple[int, int]:
+    return (_ALL, 0) if role is SocketRole.SERVICES else (0, _ALL)
 
 
 def reuseport_index() -> list[Instruction]:
@@ -80,12 +80,12 @@ def reuseport_index() -> list[Instruction]:
 
     The kernel ends a program that reads past the end with 0, which is the engine's index.
     """
-    return _by_type(0, Role.SERVICES, Role.ENGINE)
+    return _by_type(0, SocketRole.SERVICES, SocketRole.ENGINE)
 
 
-def udp_filter(role: Role) -> list[Instruction]:
+def udp_filter(role: SocketRole) -> list[Instruction]:
     """Keep the datagrams of *role*; those too short to have a type are the engine's."""
-    short = _ALL if role is Role.ENGINE else 0
+    short = _ALL if role is SocketRole.ENGINE else 0
     return [
         (_LOAD_SIZE, 0, 0, 0),
         # A load beyond the end ends the program with 0, which drops the datagram: the engine would
@@ -96,7 +96,7 @@ def udp_filter(role: Role) -> list[Instruction]:
     ]
 
 
-def packet_filter(role: Role) -> list[Instruction]:
+def packet_filter(role: SocketRole) -> list[Instruction]:
     """Keep EtherCAT frames of *role* that are addressed to this host or to a group.
 
     The kernel has taken a VLAN tag out before the program runs.

@@ -121,7 +121,7 @@ def open_udp_group_pair(
     """
     pair = _two_sockets()
     try:
-        for role, sock in zip(bpf.Role, pair, strict=True):
+        for role, sock in zip(bpf.SocketRole, pair, strict=True):
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             prepare_receiver(sock)
             bpf.attach(sock, bpf.udp_filter(role))

@@ -44,9 +44,9 @@ def open_packet_pair(interface: str) -> tuple[socket.socket, socket.socket]:
         EnvironmentalError: the interface is missing, down or no Ethernet, or CAP_NET_RAW is.
     """
     check_interface(interface)
-    engine = _open(interface, bpf.packet_filter(bpf.Role.ENGINE))
+    engine = _open(interface, bpf.packet_filter(bpf.SocketRole.ENGINE))
     try:
-        return engine, _open(interface, bpf.packet_filter(bpf.Role.SERVICES))
+        return engine, _open(interface, bpf.packet_filter(bpf.SocketRole.SERVICES))
     except BaseException:
         engine.close()
         raise

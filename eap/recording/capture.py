@@ -1,6 +1,6 @@
 """Capture of values and frames of a running appliance, by reading its shared memory.
 
-A :class:`StationCapture` reads the samples of one station, a :class:`FrameCapture` the ring of
+A :class:`StationCapture` reads the samples of one station, a :class:`PortCapture` the ring of
 frames.  Nothing here talks to a process of the plant, and the plant never waits for it.  Each look
 returns what came since the one before, and what was missed: that is the recorder's loss, unlike
 cycles that did not run because the engine was restarted.
@@ -30,7 +30,7 @@ _HEAD = struct.Struct("<qq")
 """Cycle and Unix time in front of each sample of a block."""
 
 
-class Block(NamedTuple):
+class CapturedBlock(NamedTuple):
     """Samples of a station, or frames, that were captured in one look.
 
     *source* is the name of a station, or empty for frames; *data* are samples behind their heads
@@ -59,7 +59,7 @@ class Gap(NamedTuple):
 class Look(NamedTuple):
     """Result of one look."""
 
-    blocks: list[Block]
+    blocks: list[CapturedBlock]
     gaps: list[Gap]
 
 
@@ -69,7 +69,7 @@ def unix_offset_ns() -> int:
     return min(time_ns() - monotonic_ns() for _ in range(3))
 
 
-def samples_in(block: Block) -> Iterator[tuple[int, int, bytes]]:
+def samples_in(block: CapturedBlock) -> Iterator[tuple[int, int, bytes]]:
     """Yield cycle, Unix time and sample of a block of values."""
     data, step = block.data, _HEAD.size + block.size
     for at in range(0, len(data), step):
@@ -77,7 +77,7 @@ def samples_in(block: Block) -> Iterator[tuple[int, int, bytes]]:
         yield cycle, time, data[at + _HEAD.size : at + step]
 
 
-def frames_in(block: Block, ports: Sequence[bool]) -> Iterator[tuple[int, RingRecord]]:
+def frames_in(block: CapturedBlock, ports: Sequence[bool]) -> Iterator[tuple[int, RingRecord]]:
     """Yield Unix time and record of those frames of a block whose *ports* are true."""
     for record in records_in(block.data, ports):
         yield record.at_ns + block.offset_ns, record
@@ -160,7 +160,7 @@ class StationCapture(Closeable):
         if not parts:
             return Look([], gaps)
         source, size = self.layout.station, len(parts[1])
-        return Look([Block(source, first_ns, last_ns, b"".join(parts), size)], gaps)
+        return Look([CapturedBlock(source, first_ns, last_ns, b"".join(parts), size)], gaps)
 
     def follow(self, *, thoroughly: bool) -> bool:
         """Go to the image that has replaced the present one; return whether there is one.
@@ -198,7 +198,7 @@ class StationCapture(Closeable):
         return int(self._file.image.words[word])
 
 
-class FrameCapture(Closeable):
+class PortCapture(Closeable):
     """Frames of all ports of an appliance.
 
     Args:
@@ -232,7 +232,7 @@ class FrameCapture(Closeable):
             first_ns = next(records_in(octets)).at_ns + offset_ns
             if lost:
                 gaps.append(Gap("", first_ns, lost, is_loss=True))
-            blocks.append(Block("", first_ns, now_ns, octets, offset_ns=offset_ns))
+            blocks.append(CapturedBlock("", first_ns, now_ns, octets, offset_ns=offset_ns))
         return Look(blocks, gaps)
 
 
@@ -270,7 +270,7 @@ def count_of(image: Image, counter: str) -> int:
     raise ValueError(f"{counter} is no counter; counters are {', '.join(COUNTERS)}")
 
 
-class SampledValue:
+class SampledVariable:
     """A variable, or a part of one, in the samples of a station.
 
     Raises:
@@ -305,7 +305,7 @@ def find_name(images: Mapping[str, Image], name: str) -> tuple[list[str], str, b
             f"condition: unknown station {station!r}; known stations: {', '.join(images)}"
         )
     try:
-        SampledValue(images[station], rest)
+        SampledVariable(images[station], rest)
     except ImageError as exc:
         if rest in COUNTERS:
             return [station], rest, True

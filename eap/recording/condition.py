@@ -9,7 +9,7 @@ from typing import Any
 
 from eap.closeable import Closeable
 from eap.expressions import Condition
-from eap.recording.capture import SampledValue, StationCapture, count_of, find_name, samples_in
+from eap.recording.capture import SampledVariable, StationCapture, count_of, find_name, samples_in
 
 
 class ConditionWatch(Closeable):
@@ -73,7 +73,7 @@ class ConditionWatch(Closeable):
 
     def _find_names(self) -> None:
         images = {name: capture.image for name, capture in self._captures.items()}
-        self._sampled: dict[str, list[tuple[int, SampledValue]]] = {name: [] for name in images}
+        self._sampled: dict[str, list[tuple[int, SampledVariable]]] = {name: [] for name in images}
         self._counters: list[tuple[int, str, str]] = []
         for index, name in enumerate(self._condition.names):
             stations, variable, is_counter = find_name(images, name)
@@ -81,7 +81,9 @@ class ConditionWatch(Closeable):
                 if is_counter:
                     self._counters.append((index, station, variable))
                 else:
-                    self._sampled[station].append((index, SampledValue(images[station], variable)))
+                    self._sampled[station].append(
+                        (index, SampledVariable(images[station], variable))
+                    )
         self._counts = {
             (station, counter): count_of(images[station], counter)
             for _, station, counter in self._counters

@@ -9,7 +9,7 @@ from time import time_ns
 from typing import TypeAlias
 
 from eap.errors import EapError
-from eap.recording.capture import Block, Gap
+from eap.recording.capture import CapturedBlock, Gap
 from eap.recording.files import FileSequence, OpenFile
 from eap.recording.header import RecordingEvent
 from eap.recording.stores import StoreSequence
@@ -46,7 +46,7 @@ class DiskThread:
         """Begin the next file, and divide it as the files want it."""
         self._post(lambda files: self._begin(files, make, time_ns))
 
-    def write(self, block: Block) -> bool:
+    def write(self, block: CapturedBlock) -> bool:
         """Write a block; return False if too much waits already, and it is lost."""
         if self._waiting + len(block.data) > QUEUE_BYTES:
             return False
@@ -89,7 +89,7 @@ class DiskThread:
         self._open = make
         files.open(make, time_ns)
 
-    def _write(self, files: FileSequence | StoreSequence, block: Block) -> None:
+    def _write(self, files: FileSequence | StoreSequence, block: CapturedBlock) -> None:
         if self._open is not None and files.is_due(block.first_ns):
             files.open(self._open, block.first_ns)
         files.write(block)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Protocol, TypeAlias
 
 from eap.errors import EapError
-from eap.recording.capture import Block, Gap
+from eap.recording.capture import CapturedBlock, Gap
 from eap.recording.header import RecordingEvent
 
 ROOM_BYTES = 2 << 20
@@ -39,7 +39,7 @@ class RecordingFile(Protocol):
     def messages(self) -> int:
         """Number of messages or frames so far."""
 
-    def write(self, block: Block) -> None:
+    def write(self, block: CapturedBlock) -> None:
         """Add a block."""
 
     def add_gap(self, gap: Gap) -> None:
@@ -137,7 +137,7 @@ class FileSequence:
         by_time = self._split_ns and time_ns - self._began_ns >= self._split_ns
         return bool(by_time or (self._split_bytes and file.size >= self._split_bytes))
 
-    def write(self, block: Block) -> None:
+    def write(self, block: CapturedBlock) -> None:
         """Write a block to the present file.
 
         Raises:

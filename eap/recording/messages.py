@@ -79,14 +79,14 @@ class Leaf(NamedTuple):
     bit_offset: int
 
 
-class _Group(NamedTuple):
+class _PartGroup(NamedTuple):
     """A value of variable length, or of several parts: tag, then its length, then its parts."""
 
     tag: bytes
     parts: list[_Part]
 
 
-_Part: TypeAlias = "bytes | Leaf | _Group"
+_Part: TypeAlias = "bytes | Leaf | _PartGroup"
 
 
 def varint(number: int) -> bytes:
@@ -184,9 +184,9 @@ def _parts(number: int, path: str, kind: DataType, bit_offset: int) -> Iterator[
     )
     if wire is None:
         for leaf in leaves:
-            yield _Group(_tag(number, _LENGTH), list(_content(leaf)))
+            yield _PartGroup(_tag(number, _LENGTH), list(_content(leaf)))
     elif isinstance(kind, Array):
-        yield _Group(_tag(number, _LENGTH), list(leaves))
+        yield _PartGroup(_tag(number, _LENGTH), list(leaves))
     else:
         yield _tag(number, wire[0])
         yield from leaves
@@ -227,7 +227,7 @@ def _fixed_sizes(parts: Iterable[_Part]) -> int | None:
 def _flatten(parts: Iterable[_Part]) -> Iterator[bytes | Leaf]:
     """Yield parts of fixed size without groups."""
     for part in parts:
-        if isinstance(part, _Group):
+        if isinstance(part, _PartGroup):
             size = _fixed_sizes(part.parts)
             assert size is not None  # noqa: S101  callers pass parts of fixed size only
             yield part.tag + varint(size)
@@ -390,7 +390,7 @@ def _encode(parts: Iterable[_Part], sample: bytes) -> bytes:
     for part in parts:
         if isinstance(part, bytes):
             found += part
-        elif isinstance(part, _Group):
+        elif isinstance(part, _PartGroup):
             inner = _encode(part.parts, sample)
             found += part.tag + varint(len(inner)) + inner
         else:
@@ -405,7 +405,7 @@ def _encode(parts: Iterable[_Part], sample: bytes) -> bytes:
     return bytes(found)
 
 
-class _Reader:
+class _PartReader:
     """Part of a message whose values vary in length; *at* is the position in it."""
 
     def __init__(self, message: bytes, at: int) -> None:
@@ -418,7 +418,7 @@ class _Reader:
             if isinstance(part, bytes):
                 if self._take(len(part), end) != part:
                     raise self._damaged()
-            elif isinstance(part, _Group):
+            elif isinstance(part, _PartGroup):
                 if self._take(len(part.tag), end) != part.tag:
                     raise self._damaged()
                 inner = self._varint(end) + self.at
@@ -526,7 +526,7 @@ class StationMessages:
             cycle, *values = self._fixed.unpack_from(message)
         except struct.error:
             raise MalformedError("is too short", layout="message", offset=len(message)) from None
-        reader = _Reader(message, self._fixed.size)
+        reader = _PartReader(message, self._fixed.size)
         values += reader.read(self._varying, len(message))
         if reader.at != len(message):
             raise MalformedError("is too long", layout="message", offset=reader.at)
@@ -565,7 +565,7 @@ def _leaves(parts: Iterable[_Part]) -> Iterator[Leaf]:
     for part in parts:
         if isinstance(part, Leaf):
             yield part
-        elif isinstance(part, _Group):
+        elif isinstance(part, _PartGroup):
             yield from _leaves(part.parts)
 
 

@@ -24,10 +24,10 @@ from eap.expressions import Condition
 from eap.net.image_file import open_image
 from eap.pd.layout import ImageLayout
 from eap.recording.capture import (
-    Block,
-    FrameCapture,
+    CapturedBlock,
     Gap,
     Look,
+    PortCapture,
     StationCapture,
     frames_in,
     samples_in,
@@ -38,7 +38,7 @@ from eap.recording.disk import DiskThread
 from eap.recording.files import FileSequence, RecordingFile
 from eap.recording.header import EventKind, RecordingEvent
 from eap.recording.published import published_by
-from eap.recording.ring import BlockRing, Trigger, TriggerAction
+from eap.recording.ring import BlockRing, RecordingTrigger, TriggerAction
 from eap.recording.selection import matcher, select_variables
 from eap.recording.sinks import FramesSink, ValuesSink, header_of, placed_variables
 from eap.recording.stores import StoreSequence, StoreSink, make_store, shown_url
@@ -137,14 +137,14 @@ class Attachment(Closeable):
         self.info = info
         self._paths = {name: self._folder.image(name) for name in info.stations}
         self._stations: list[StationCapture] = []
-        self.frames: FrameCapture | None = None
+        self.frames: PortCapture | None = None
         self.condition: ConditionWatch | None = None
         self._check_ns = 0
         try:
             self._files = self._image_files()
             self.layouts = self._read_layouts()
             if options.kind == "frames":
-                self.frames = FrameCapture(self._folder.frames)
+                self.frames = PortCapture(self._folder.frames)
             else:
                 self._open_stations()
             if options.when:
@@ -296,7 +296,7 @@ class Recorder:
                 room=options.room,
             )
         self._ring = _make_ring(options.ring_ns) if has_ring else None
-        self._trigger = Trigger(options.before_ns, options.after_ns)
+        self._trigger = RecordingTrigger(options.before_ns, options.after_ns)
         self._events: deque[tuple[int, RecordingEvent | Gap]] = deque(maxlen=_KEPT_EVENTS)
         self._disk = DiskThread(self._files)
         self._needs_file = self._ring is None
@@ -448,7 +448,7 @@ class Recorder:
             action = self._trigger.handle_time(now_ns + offset_ns)
             self._act(attached, now_ns + offset_ns, action)
 
-    def _write(self, block: Block) -> None:
+    def _write(self, block: CapturedBlock) -> None:
         if not self._disk.write(block):
             lost = _count(block)
             self.state.lost += lost
@@ -520,7 +520,7 @@ def _seconds(ns: int) -> str:
     return f"{ns / 1e9:g}s" if ns else ""
 
 
-def _count(block: Block) -> int:
+def _count(block: CapturedBlock) -> int:
     """Return the number of samples or frames of a block."""
     found = samples_in(block) if block.size else frames_in(block, ())
     return sum(1 for _ in found)

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from enum import Enum, auto
 
-from eap.recording.capture import Block
+from eap.recording.capture import CapturedBlock
 
 RING_BYTES = 256 << 20
 """Memory of a ring; a longer one has its newest part only."""
@@ -38,11 +38,11 @@ class BlockRing:
         self._compress = compress
         self._decompress = decompress
         self._limit = limit
-        self._blocks: deque[tuple[Block, bool]] = deque()
+        self._blocks: deque[tuple[CapturedBlock, bool]] = deque()
         self.size = 0
         self.is_cut = False
 
-    def add(self, block: Block) -> None:
+    def add(self, block: CapturedBlock) -> None:
         """Keep *block*, and drop what is too old or too much."""
         packed = len(block.data) >= _COMPRESS_FROM
         if packed:
@@ -55,7 +55,7 @@ class BlockRing:
             self._drop()
             self.is_cut = True
 
-    def since(self, time_ns: int) -> Iterator[Block]:
+    def since(self, time_ns: int) -> Iterator[CapturedBlock]:
         """Yield the blocks with something at or after *time_ns* in Unix time, the oldest first."""
         for block, packed in self._blocks:
             if block.last_ns >= time_ns:
@@ -89,7 +89,7 @@ class TriggerAction(Enum):
     """The time after the last trigger is over."""
 
 
-class Trigger:
+class RecordingTrigger:
     """Times to record around the moments in which a condition becomes true.
 
     Args:

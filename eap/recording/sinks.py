@@ -14,7 +14,7 @@ from eap.pd.address import from_word
 from eap.pd.framering import RingRecord
 from eap.pd.layout import ImageLayout
 from eap.quantities import count
-from eap.recording.capture import Block, Gap, frames_in, samples_in
+from eap.recording.capture import CapturedBlock, Gap, frames_in, samples_in
 from eap.recording.frames_writer import FramesWriter, Wrapping, ethernet_wrapping, udp_wrapping
 from eap.recording.header import AttachedFile, EventKind, RecordingEvent, RecordingHeader
 from eap.recording.messages import PlacedVariable, RecordedVariable
@@ -102,7 +102,7 @@ class ValuesSink:
         """Number of messages so far."""
         return self._writer.messages
 
-    def write(self, block: Block) -> None:
+    def write(self, block: CapturedBlock) -> None:
         """Add a block."""
         station = self._stations.get(block.source)
         if station is None:
@@ -178,7 +178,7 @@ class FramesSink:
         """Number of frames so far."""
         return self._writer.frames
 
-    def write(self, block: Block) -> None:
+    def write(self, block: CapturedBlock) -> None:
         """Add a block."""
         names = self._ports_now()
         if len(names) != len(self._ports):

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit, urlunsplit
 
 from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.layout import ImageLayout
-from eap.recording.capture import Block, Gap, samples_in
+from eap.recording.capture import CapturedBlock, Gap, samples_in
 from eap.recording.files import OpenFile
 from eap.recording.header import EventKind, RecordingEvent, RecordingHeader
 from eap.recording.messages import StationMessages
@@ -133,7 +133,7 @@ class StoreSink:
                 tables.append(StoreTable(layout.station, source_of(messages).columns))
         sequence.begin(header.plant, tables)
 
-    def add(self, block: Block) -> int:
+    def add(self, block: CapturedBlock) -> int:
         """Queue the rows of *block*; return their number."""
         found = self._stations.get(block.source)
         if found is None:
@@ -217,7 +217,7 @@ class StoreSequence:
         del time_ns
         return False
 
-    def write(self, block: Block) -> None:
+    def write(self, block: CapturedBlock) -> None:
         """Queue the rows of a block."""
         if self._sink is not None:
             self._sink.add(block)

@@ -23,7 +23,7 @@ from eap.web.feed import PlantFeed, Shown
 from eap.web.guard import TOKEN, USER, Guard, needs_user, read_json, refusal
 from eap.web.openapi import DOCUMENT
 from eap.web.rules import SetRules
-from eap.web.topics import Topics
+from eap.web.topics import PageTopics
 
 API = "/api/v1"
 _MAX_NAMES = 2000
@@ -61,7 +61,7 @@ class Api:
         self,
         section: WebSection,
         feed: PlantFeed,
-        topics: Topics,
+        topics: PageTopics,
         guard: Guard,
         end_session: Callable[[str], Awaitable[None]],
     ) -> None:

@@ -33,7 +33,7 @@ from eap.live.client import LiveClient
 from eap.live.events import LiveEvent
 from eap.live.findings import is_hung
 from eap.live.rows import pd_flows, station_rows
-from eap.live.transport import Subscription
+from eap.live.transport import ValuesSubscription
 from eap.live.view import LiveReport, LiveView
 from eap.pd.quality import QUALITY_MAX, QUALITY_NS
 from eap.pd.spec import Writer
@@ -441,7 +441,9 @@ class PlantFeed:
         self, client: LiveClient, station: str, period_ms: int, names: frozenset[str]
     ) -> None:
         sample = self._samples.setdefault((station, period_ms), _Sample(period_ms))
-        wanted = Subscription(station=station, names=tuple(sorted(names)), period_ms=period_ms)
+        wanted = ValuesSubscription(
+            station=station, names=tuple(sorted(names)), period_ms=period_ms
+        )
         async with aclosing(client.watch(wanted)) as events:
             async for event in events:
                 if isinstance(event, ValuesEvent):

@@ -11,7 +11,7 @@ MAX_POINTS = 1200
 _MIN_INTERVAL_S = 0.1
 
 
-class History:
+class VariableHistory:
     """Values of one variable over the last *window_s* seconds.
 
     Of each interval the least and the largest value are kept, so that a peak of one sample is in a

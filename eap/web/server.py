@@ -25,7 +25,7 @@ from eap.web.metrics import PATH as METRICS
 from eap.web.metrics import MetricsEndpoint
 from eap.web.sessions import Sessions
 from eap.web.sockets import Sockets
-from eap.web.topics import Topics
+from eap.web.topics import PageTopics
 
 STATIC = Path(__file__).parent / "static"
 MAX_CONNECTIONS = 512
@@ -63,7 +63,7 @@ class PageServer:
         users = {user.name: user for user in section.users}
         self.guard = Guard(section, Sessions(key, users))
         self.feed = PlantFeed(view, on_status=self._status_changed)
-        self.topics = Topics(self.feed)
+        self.topics = PageTopics(self.feed)
         self.sockets = Sockets(self.feed, self.topics, self.guard)
         self.api = Api(section, self.feed, self.topics, self.guard, self.sockets.end_session)
 

@@ -38,7 +38,7 @@ class Principal(NamedTuple):
         return RANK[self.role] >= RANK[role]
 
 
-class _Session(msgspec.Struct, frozen=True):
+class _PageSession(msgspec.Struct, frozen=True):
     user: str
     until_s: int
     nonce: str
@@ -59,7 +59,7 @@ class Sessions:
 
     def begin(self, user: str, nonce: str, now_s: float) -> str:
         """Return the token of a new session of a user whose password was right."""
-        body = msgspec.json.encode(_Session(user, int(now_s) + SESSION_S, nonce))
+        body = msgspec.json.encode(_PageSession(user, int(now_s) + SESSION_S, nonce))
         return f"{urlsafe_b64encode(body).decode()}.{self._sign(user, body)}"
 
     def find(self, token: str, now_s: float) -> Principal | None:
@@ -69,7 +69,7 @@ class Sessions:
         encoded, _, signature = token.partition(".")
         try:
             body = urlsafe_b64decode(encoded)
-            session = msgspec.json.decode(body, type=_Session)
+            session = msgspec.json.decode(body, type=_PageSession)
         except (ValueError, msgspec.MsgspecError):
             return None
         user = self._users.get(session.user)

@@ -18,7 +18,7 @@ from eap.release import RELEASE
 from eap.web.feed import PlantFeed
 from eap.web.guard import TOKEN, Guard, needs_user, refusal
 from eap.web.sessions import SESSION_S
-from eap.web.topics import Slot, Topics
+from eap.web.topics import PageTopics, Slot
 
 MAX_CLIENTS = 200
 MAX_PER_HOST = 100
@@ -44,7 +44,7 @@ class Sockets:
         guard: Has the sessions.
     """
 
-    def __init__(self, feed: PlantFeed, topics: Topics, guard: Guard) -> None:
+    def __init__(self, feed: PlantFeed, topics: PageTopics, guard: Guard) -> None:
         self._feed = feed
         self._topics = topics
         self._guard = guard

@@ -26,7 +26,7 @@ from eap.config.web_sections import (
 )
 from eap.suggest import suggest
 from eap.web.feed import FAST_MS, SLOW_MS, PlantFeed
-from eap.web.history import History
+from eap.web.history import VariableHistory
 
 MAX_TOPICS = 8
 """Of a client."""
@@ -40,7 +40,7 @@ PLANT, EVENTS = "plant", "events"
 _PAGE, _VALUES = "page:", "values:"
 
 
-class Part(NamedTuple):
+class TopicPart(NamedTuple):
     """Part of a topic whose messages replace each other."""
 
     topic: str
@@ -51,10 +51,10 @@ class Slot:
     """Messages for one client that were not sent yet: the latest of each part."""
 
     def __init__(self) -> None:
-        self._messages: dict[Part, bytes] = {}
+        self._messages: dict[TopicPart, bytes] = {}
         self._has_some = asyncio.Event()
 
-    def put(self, part: Part, message: bytes) -> None:
+    def put(self, part: TopicPart, message: bytes) -> None:
         """Replace the message of *part*."""
         self._messages[part] = message
         self._has_some.set()
@@ -75,7 +75,7 @@ class _Topic:
         self.patterns = {FAST_MS: fast, SLOW_MS: slow}
         self.names: dict[int, list[str]] = {FAST_MS: [], SLOW_MS: []}
         self.slots: set[Slot] = set()
-        self.latest: dict[Part, bytes] = {}
+        self.latest: dict[TopicPart, bytes] = {}
 
     def resolve(self, feed: PlantFeed) -> None:
         fast = feed.resolve(self.patterns[FAST_MS])
@@ -89,7 +89,7 @@ class TopicError(ValueError):
     """A client asked for a topic that there is not."""
 
 
-class Topics:
+class PageTopics:
     """Topics of all clients, and the histories of trends.
 
     Args:
@@ -101,7 +101,7 @@ class Topics:
         self._pages: dict[str, WebPage] = {}
         self._topics: dict[str, _Topic] = {}
         self._windows: dict[str, int] = {}
-        self.histories: dict[str, History] = {}
+        self.histories: dict[str, VariableHistory] = {}
         self._version = -1
         self._tick = 0
 
@@ -163,7 +163,7 @@ class Topics:
                     continue
                 for period_ms in periods:
                     if topic.names[period_ms]:
-                        self._send(topic, Part(topic.name, period_ms))
+                        self._send(topic, TopicPart(topic.name, period_ms))
             due_s = max(due_s + FAST_MS / 1000, clock())
             await asyncio.sleep(due_s - clock())
 
@@ -172,16 +172,16 @@ class Topics:
         for name in (PLANT, EVENTS):
             if (topic := self._topics.get(name)) is None:
                 continue
-            part = Part(name, SLOW_MS)
+            part = TopicPart(name, SLOW_MS)
             if name == PLANT or (self._feed.report is not None and self._feed.report.events):
                 self._send(topic, part)
 
-    def _send(self, topic: _Topic, part: Part) -> None:
+    def _send(self, topic: _Topic, part: TopicPart) -> None:
         message = topic.latest[part] = self._encode(topic, part)
         for slot in topic.slots:
             slot.put(part, message)
 
-    def _encode(self, topic: _Topic, part: Part) -> bytes:
+    def _encode(self, topic: _Topic, part: TopicPart) -> bytes:
         head: dict[str, Any] = {"topic": topic.name, "time": round(time(), 3)}
         if topic.name == PLANT:
             return msgspec.json.encode({"type": "plant", **head, **self._feed.overview()})
@@ -191,10 +191,10 @@ class Topics:
         values = {name: shown(name, now_s) for name in topic.names[part.period_ms]}
         return msgspec.json.encode({"type": "values", **head, "values": values})
 
-    def _parts(self, topic: _Topic) -> list[Part]:
+    def _parts(self, topic: _Topic) -> list[TopicPart]:
         if topic.name in {PLANT, EVENTS}:
-            return [Part(topic.name, SLOW_MS)]
-        return [Part(topic.name, period) for period, names in topic.names.items() if names]
+            return [TopicPart(topic.name, SLOW_MS)]
+        return [TopicPart(topic.name, period) for period, names in topic.names.items() if names]
 
     def _open(self, name: str) -> _Topic:
         if len(name) > MAX_TOPIC:
@@ -234,7 +234,7 @@ class Topics:
         self.histories = {
             name: kept
             if (kept := self.histories.get(name)) is not None and kept.window_s == window_s
-            else History(window_s)
+            else VariableHistory(window_s)
             for name, window_s in windows.items()
         }
         topics = self._topics.values()

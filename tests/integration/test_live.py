@@ -15,7 +15,7 @@ from eap.errors import ControlError
 from eap.live.client import LiveClient
 from eap.live.findings import Severity
 from eap.live.rows import station_rows
-from eap.live.transport import Subscription
+from eap.live.transport import ValuesSubscription
 from eap.live.view import LiveReport, LiveView
 from tests.support.appliance import Appliance, Plants, plants
 
@@ -120,7 +120,7 @@ def test_client_calls_methods_of_the_control_protocol(plant: Appliance) -> None:
 
 def test_client_watches_values_over_a_restart_of_services(plant: Appliance) -> None:
     async def values(client: LiveClient) -> AsyncIterator[ValuesEvent]:
-        wanted = Subscription(station="one", names=("ticks", "setpoint"), period_ms=20)
+        wanted = ValuesSubscription(station="one", names=("ticks", "setpoint"), period_ms=20)
         async with aclosing(client.watch(wanted)) as events:
             async for event in events:
                 if isinstance(event, ValuesEvent):
@@ -146,7 +146,9 @@ def test_slow_consumer_gets_one_event_with_the_latest_values(plant: Appliance) -
     async def script(view: LiveView) -> None:
         await reports(view, lambda report: report.status.stations)
         client = view.client_of("live", "one")
-        changes = Subscription(station="one", names=("ticks",), period_ms=10, only_changes=True)
+        changes = ValuesSubscription(
+            station="one", names=("ticks",), period_ms=10, only_changes=True
+        )
         async with aclosing(client.watch(changes)) as events:
             first = await anext(events)
             await asyncio.sleep(0.5)  # the consumer does something else

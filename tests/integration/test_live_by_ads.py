@@ -18,7 +18,7 @@ from eap.errors import ControlError
 from eap.live.ads_connection import AdsConnection, RemoteHost
 from eap.live.client import LiveClient
 from eap.live.rows import station_rows
-from eap.live.transport import Subscription
+from eap.live.transport import ValuesSubscription
 from eap.live.view import LiveView
 from tests.support.appliance import Appliance, Plants, plants
 
@@ -171,7 +171,7 @@ def test_remote_client_reads_writes_and_watches(plant: Appliance) -> None:
         assert (await client.call(WRITE, station="open", values=values)).written == 2
         found = await client.call(READ, station="open", names=["setpoint", "label"])
         assert found.values == values
-        wanted = Subscription(station="open", names=("ticks",), period_ms=20)
+        wanted = ValuesSubscription(station="open", names=("ticks",), period_ms=20)
         async with aclosing(client.watch(wanted)) as events:
             first, second = await anext(events), await anext(events)
         assert isinstance(first, ValuesEvent)

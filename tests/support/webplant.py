@@ -16,7 +16,7 @@ from eap.config.web_sections import Role, WebPage, WebSection, WebUser
 from eap.control.protocol import ErrorCode, ValuesEvent
 from eap.errors import ControlError
 from eap.live.client import LiveClient
-from eap.live.transport import Subscription
+from eap.live.transport import ValuesSubscription
 from eap.live.view import LiveView
 from eap.web.server import PageServer
 from tests.support.statusdocument import document, rx
@@ -35,7 +35,7 @@ VARIABLES = [
 
 
 class StubPlant:
-    """Control connection of a plant ``line`` with the station ``mixer`` (ControlConnection).
+    """Control connection of a plant ``line`` with the station ``mixer`` (PlantConnection).
 
     Attributes:
         values: Present values.
@@ -57,7 +57,7 @@ class StubPlant:
             raise ControlError("it closed the connection", code=ErrorCode.UNAVAILABLE)
         return copy.deepcopy(getattr(self, f"_{method}")(params))
 
-    async def watch(self, wanted: Subscription) -> AsyncGenerator[ValuesEvent | ControlError]:
+    async def watch(self, wanted: ValuesSubscription) -> AsyncGenerator[ValuesEvent | ControlError]:
         while self.answers:
             yield ValuesEvent(**self._read({"names": wanted.names}), skipped=0)
             await asyncio.sleep(wanted.period_ms / 1000)

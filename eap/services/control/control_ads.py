@@ -67,7 +67,7 @@ def _decode(line: bytes) -> Request:
     return decode_request(line)
 
 
-class _Client(NamedTuple):
+class _RequestOrigin(NamedTuple):
     """Client of one request."""
 
     endpoint: Endpoint
@@ -76,7 +76,7 @@ class _Client(NamedTuple):
 
 
 class _KeptAnswer(NamedTuple):
-    client: _Client
+    client: _RequestOrigin
     line: bytes
     until_s: float
 
@@ -109,7 +109,7 @@ class RemoteControl:
         """Take a request of a client; return whether the rates allow it."""
         return self._rates.take(host_of(endpoint), self._clock())
 
-    async def answer(self, client: _Client, station: str, line: bytes, length: int) -> bytes:
+    async def answer(self, client: _RequestOrigin, station: str, line: bytes, length: int) -> bytes:
         """Return the first *length* bytes of the answer to a request, behind their head.
 
         Args:
@@ -129,7 +129,7 @@ class RemoteControl:
             answer = encode_failure(number, failure_of(exc))
         return self._first_part(client, answer.rstrip(b"\n"), length)
 
-    def part(self, client: _Client, wanted: PartRequest, length: int) -> OperationOutcome:
+    def part(self, client: _RequestOrigin, wanted: PartRequest, length: int) -> OperationOutcome:
         """Return the bytes of an answer that follow a part; the last one ends it."""
         self._drop_old()
         kept = self._kept.get(wanted.ticket)
@@ -141,7 +141,7 @@ class RemoteControl:
             self._drop(wanted.ticket)
         return OperationOutcome(data=head + kept.line[wanted.position : end])
 
-    async def _result(self, client: _Client, station: str, request: Request) -> Any:
+    async def _result(self, client: _RequestOrigin, station: str, request: Request) -> Any:
         method, params = request.method, request.params
         if method not in READ_METHODS:
             names = ", ".join(sorted(READ_METHODS))
@@ -167,19 +167,19 @@ class RemoteControl:
             self._status = now_s, await self._call("status", params)
         return self._status[1]
 
-    def _require(self, client: _Client, station: str) -> None:
+    def _require(self, client: _RequestOrigin, station: str) -> None:
         """Raise ControlError if the rules of another station deny the client to read it."""
         router = self._routers[station]
         header, body = _read_request(client, router.net_id)
         if why := router.denial(header, body, client.endpoint):
             raise ControlError(f"station {station}: {why}", code=ErrorCode.REFUSED)
 
-    def _may(self, client: _Client, station: str) -> bool:
+    def _may(self, client: _RequestOrigin, station: str) -> bool:
         router = self._routers[station]
         grants = router.access.grants(client.endpoint, client.source, router.net_id, CONTROL_PORT)
         return grants.decide(_READ).is_allowed
 
-    def _first_part(self, client: _Client, line: bytes, length: int) -> bytes:
+    def _first_part(self, client: _RequestOrigin, line: bytes, length: int) -> bytes:
         space = max(0, length - AnswerPart.SIZE)
         if len(line) <= space:
             return AnswerPart(0, len(line)).encode() + line
@@ -221,7 +221,7 @@ class ControlAds:
         header = request.header
         if not self._control.is_admitted(request.endpoint):
             return AmsAnswer(error_code=AdsError.MAILBOX_FULL)
-        client = _Client(request.endpoint, header.source, header.source_port)
+        client = _RequestOrigin(request.endpoint, header.source, header.source_port)
 
         def perform(operation: object) -> OperationOutcome | Awaitable[OperationOutcome]:
             if not isinstance(operation, ReadWrite) or operation.group != IndexGroup.CONTROL:
@@ -241,7 +241,7 @@ class ControlAds:
     def client_gone(self, endpoint: Endpoint) -> None:
         """Do nothing: answers that are kept end by time (Service)."""
 
-    async def _answer(self, client: _Client, operation: ReadWrite) -> OperationOutcome:
+    async def _answer(self, client: _RequestOrigin, operation: ReadWrite) -> OperationOutcome:
         answer = await self._control.answer(client, self._station, operation.data, operation.length)
         return OperationOutcome(data=answer)
 
@@ -249,7 +249,7 @@ class ControlAds:
 _READ = ReadWrite(IndexGroup.CONTROL, ControlOffset.REQUEST, 0, b"")
 
 
-def _read_request(client: _Client, target: NetId) -> tuple[AmsHeader, bytes]:
+def _read_request(client: _RequestOrigin, target: NetId) -> tuple[AmsHeader, bytes]:
     command, body = encode_query(_READ)
     header = AmsHeader(target, CONTROL_PORT, client.source, client.source_port, AmsCommand(command))
     return header, body

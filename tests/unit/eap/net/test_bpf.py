@@ -36,11 +36,11 @@ def exchange(role_filter, datagrams=DATAGRAMS):
 
 
 def test_engine_gets_its_types_unknown_ones_and_short_datagrams():
-    assert exchange(bpf.udp_filter(bpf.Role.ENGINE)) == ENGINE_TYPES | {0xEE}
+    assert exchange(bpf.udp_filter(bpf.SocketRole.ENGINE)) == ENGINE_TYPES | {0xEE}
 
 
 def test_udp_pair_sorts_acyclic_types_to_services():
-    assert exchange(bpf.udp_filter(bpf.Role.SERVICES)) == {2, 3, 5}
+    assert exchange(bpf.udp_filter(bpf.SocketRole.SERVICES)) == {2, 3, 5}
 
 
 def test_kernel_refusal_is_an_os_error():
@@ -55,7 +55,7 @@ def ethernet_like(frame_type, ethertype=b"\x88\xa4"):
 
 
 @pytest.mark.parametrize(
-    ("role", "types"), [(bpf.Role.ENGINE, ENGINE_TYPES), (bpf.Role.SERVICES, {2, 3, 5})]
+    ("role", "types"), [(bpf.SocketRole.ENGINE, ENGINE_TYPES), (bpf.SocketRole.SERVICES, {2, 3, 5})]
 )
 def test_packet_filter_keeps_its_types_of_our_ethertype(role, types):
     datagrams = [ethernet_like(n) for n in range(16)]

@@ -15,8 +15,8 @@ from eap.pd.layout import plan_layout
 from eap.pd.spec import VariableSpec
 from eap.pd.words import RxWord, StationWord
 from eap.recording.capture import (
-    FrameCapture,
-    SampledValue,
+    PortCapture,
+    SampledVariable,
     StationCapture,
     count_of,
     find_name,
@@ -39,7 +39,7 @@ def engine(tmp_path):
 
 
 def ticks(capture, look):
-    value = SampledValue(capture.image, "ticks")
+    value = SampledVariable(capture.image, "ticks")
     return [
         (cycle, time_ns, value.read(sample))
         for block in look.blocks
@@ -140,7 +140,7 @@ def test_capture_without_an_image_is_refused(tmp_path):
 def test_frames_come_with_port_direction_and_time(tmp_path):
     with (
         FrameRingFile(tmp_path / "frames.ring") as file,
-        FrameCapture(file_path(tmp_path)) as capture,
+        PortCapture(file_path(tmp_path)) as capture,
     ):
         assert file.header.is_wanted(monotonic_ns())
         writer = file.writer()
@@ -162,7 +162,7 @@ def file_path(folder):
 
 
 def test_frames_that_were_overwritten_are_counted(tmp_path):
-    with FrameRingFile(file_path(tmp_path)) as file, FrameCapture(file_path(tmp_path)) as capture:
+    with FrameRingFile(file_path(tmp_path)) as file, PortCapture(file_path(tmp_path)) as capture:
         writer = file.writer()
         for _ in range(20_000):
             writer.add(0, 1, 0, memoryview(bytes(1000)))

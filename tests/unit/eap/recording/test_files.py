@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.recording.capture import Block, Gap
+from eap.recording.capture import CapturedBlock, Gap
 from eap.recording.disk import DiskThread
 from eap.recording.files import ROOM_BYTES, DiskFullError, FileSequence, room_on
 from eap.recording.header import EventKind, RecordingEvent
@@ -30,7 +30,7 @@ class PlainFile:
     def size(self) -> int:
         return self.path.stat().st_size
 
-    def write(self, block: Block) -> None:
+    def write(self, block: CapturedBlock) -> None:
         if self._failing:
             raise OSError(self._failing.pop(), "failed")
         with self.path.open("ab") as file:
@@ -70,7 +70,7 @@ class Files:
         for second in seconds:
             if not self.sequence.is_open or self.sequence.is_due(second * S):
                 self.sequence.open(self.make, second * S)
-            self.sequence.write(Block("a", second * S, second * S, bytes(size)))
+            self.sequence.write(CapturedBlock("a", second * S, second * S, bytes(size)))
 
     def names(self) -> list[str]:
         return sorted(each.name for each in self.sequence._base.parent.iterdir())
@@ -163,7 +163,7 @@ def test_disk_thread_writes_in_order_and_divides(tmp_path):
     disk = DiskThread(files.sequence)
     disk.open(files.make, 0)
     for second in range(25):
-        assert disk.write(Block("a", second * S, second * S, b"x"))
+        assert disk.write(CapturedBlock("a", second * S, second * S, b"x"))
     disk.add_event(RecordingEvent(time_ns=25 * S, kind=EventKind.MARK, text="door open"))
     disk.add_gap(Gap("a", 25 * S, 7, is_loss=True))
     disk.end(26 * S)
@@ -178,8 +178,8 @@ def test_disk_thread_reports_its_first_failure_and_ends_in_order(tmp_path):
     disk = DiskThread(files.sequence)
     disk.open(files.make, 0)
     files.failing += [errno.EIO]
-    disk.write(Block("a", 0, 0, b"x"))
-    disk.write(Block("a", 0, 0, b"y"))
+    disk.write(CapturedBlock("a", 0, 0, b"x"))
+    disk.write(CapturedBlock("a", 0, 0, b"y"))
     assert disk.close_file(0).wait(10)
     disk.end(0)
     assert "failed" in disk.failure
@@ -198,7 +198,7 @@ def test_blocks_that_the_disk_cannot_take_in_time_are_refused(tmp_path, monkeypa
     files = Files(tmp_path)
     disk = DiskThread(files.sequence)
     try:
-        assert not disk.write(Block("a", 0, 0, bytes(11)))
-        assert disk.write(Block("a", 0, 0, bytes(10)))
+        assert not disk.write(CapturedBlock("a", 0, 0, bytes(11)))
+        assert disk.write(CapturedBlock("a", 0, 0, bytes(10)))
     finally:
         disk.end(0)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import zlib
 
-from eap.recording.capture import Block
-from eap.recording.ring import BlockRing, Trigger, TriggerAction
+from eap.recording.capture import CapturedBlock
+from eap.recording.ring import BlockRing, RecordingTrigger, TriggerAction
 
 S = 1_000_000_000
 
@@ -14,8 +14,8 @@ def ring(length_s: int, **limits: int) -> BlockRing:
     return BlockRing(length_s * S, zlib.compress, zlib.decompress, **limits)
 
 
-def block(second: float, data: bytes = b"x" * 5000) -> Block:
-    return Block("a", int(second * S), int(second * S) + S // 2, data)
+def block(second: float, data: bytes = b"x" * 5000) -> CapturedBlock:
+    return CapturedBlock("a", int(second * S), int(second * S) + S // 2, data)
 
 
 def test_ring_keeps_the_last_seconds_and_compresses_them():
@@ -47,7 +47,7 @@ def test_ring_without_room_drops_the_oldest_and_says_so():
 
 
 def test_trigger_opens_when_the_condition_becomes_true_and_closes_after_its_time():
-    trigger = Trigger(20 * S, 10 * S)
+    trigger = RecordingTrigger(20 * S, 10 * S)
     assert trigger.update(1 * S, is_true=False) is None
     assert trigger.update(2 * S, is_true=True) is TriggerAction.OPEN
     assert trigger.update(3 * S, is_true=True) is None
@@ -61,7 +61,7 @@ def test_trigger_opens_when_the_condition_becomes_true_and_closes_after_its_time
 
 
 def test_trigger_that_comes_again_extends_the_file():
-    trigger = Trigger(20 * S, 10 * S)
+    trigger = RecordingTrigger(20 * S, 10 * S)
     trigger.update(2 * S, is_true=True)
     trigger.update(3 * S, is_true=False)
     assert trigger.update(9 * S, is_true=True) is TriggerAction.MARK
@@ -70,7 +70,7 @@ def test_trigger_that_comes_again_extends_the_file():
 
 
 def test_trigger_is_forgotten_with_its_plant():
-    trigger = Trigger(20 * S, 10 * S)
+    trigger = RecordingTrigger(20 * S, 10 * S)
     trigger.update(2 * S, is_true=True)
     trigger.reset()
     assert not trigger.is_recording
