@@ -1,5 +1,7 @@
 // Names of variables, `STATION/VARIABLE`, with members, and patterns of them.
 
+import { t } from "./language.js";
+
 /** Return the names and patterns of a panel's `of`. */
 export const namesIn = (of) => (typeof of === "string" ? [of] : of);
 
@@ -58,13 +60,12 @@ export function inputOf(type) {
 /** Return the name of a type without its definition. */
 export const typeName = (type) => type.replace(/<.*>/s, "");
 
-/** States of slaves by number, as `BUS.state` and `BUS.SLAVE.state` have them. */
-export const AL_STATES = { 0: "–", 1: "INIT", 2: "PREOP", 3: "BOOT", 4: "SAFEOP", 8: "OP" };
+const AL_STATES = { 1: "INIT", 2: "PREOP", 3: "BOOT", 4: "SAFEOP", 8: "OP" };
 
-/** Return the state that a variable has as a number of the EtherCAT state machine, or null. */
+/** Return the state of a variable with a state of slaves (`BUS.state`, `BUS.SLAVE.state`), or null. */
 export function alState(name, value, variables) {
   const comment = variables[name]?.comment ?? "";
-  return comment.includes("AL state") ? (AL_STATES[value] ?? String(value)) : null;
+  return comment.includes("AL state") ? (AL_STATES[value] ?? t("slave_silent")) : null;
 }
 
 /** Return the address of a view, such as that of a variable. */

@@ -6,8 +6,11 @@ import { hrefOf, matchesAny } from "./names.js";
 import { placeNodes, routeArrow } from "./layout.js";
 
 const BOX = { width: 132, height: 46 };
+const NARROW_BOX = { width: 106, height: 42 };
 const LABELS = 14;
 const NARROW = 560;
+const MOST_LETTERS = 17;
+const OPEN_ROWS = 12;
 const RECENT_MS = 30_000;
 
 /** Panel `plant`. */
@@ -16,9 +19,11 @@ export function graphPanel(panel, scope) {
   const frame = h("div", { class: "graph-frame" }, svg);
   const flows = table(t("process_data"), [t("from"), t("pd"), t("to"), t("subscription"), t("state"),
     { text: t("rate"), number: true }, { text: t("age"), number: true }, { text: t("lost"), number: true }, { text: t("late"), number: true }, { text: t("jitter"), number: true }]);
+  const details = h("details", {}, h("summary", {}, t("process_data")), flows.frame);
   const rows = new Rows(flows.body);
   const losses = new Losses();
   let drawing = null;
+  let isDecided = false;
   let latest = null;
   let width = 0;
 
@@ -30,6 +35,10 @@ export function graphPanel(panel, scope) {
     const shape = JSON.stringify([width, names, [...new Set(links.map((each) => each.arrow))]]);
     if (drawing?.shape !== shape && width) drawing = draw(svg, names, links, width, shape);
     if (drawing) update(drawing, message, links, losses);
+    if (!isDecided && width && links.length) {
+      isDecided = true;
+      details.open = width < NARROW && links.length <= OPEN_ROWS; // there the arrows have no labels
+    }
     rows.show(links, (each) => each.key, (each) => flowCells(each, losses));
   };
   scope.on("plant", show);
@@ -39,12 +48,14 @@ export function graphPanel(panel, scope) {
   });
   size.observe(frame);
   scope.atEnd(() => size.disconnect());
-  const details = h("details", { open: innerWidth < NARROW }, h("summary", {}, t("process_data")), flows.frame);
   return h("div", {}, frame, details);
 }
 
 function linksOf(message, of) {
-  const flows = new Map(message.flows.filter((each) => each.direction === "rx").map((each) => [`${each.station}/${each.name}`, each]));
+  const silent = new Set(message.stations.filter((each) => each.state === "no cycles").map((each) => each.name));
+  const received = message.flows.filter((each) => each.direction === "rx");
+  // A station without cycles keeps the state that its PDs had in the last one.
+  const flows = new Map(received.map((each) => [`${each.station}/${each.name}`, silent.has(each.station) ? { ...each, state: "stale" } : each]));
   return message.links.filter((each) => matchesAny(of, each.receiver) || matchesAny(of, each.sender)).map((each) => {
     const sender = each.sender || each.publisher;
     const key = `${each.receiver}/${each.subscription}`;
@@ -99,17 +110,18 @@ function flowCells(link, losses) {
 }
 
 function draw(svg, names, links, width, shape) {
+  const box = width < NARROW ? NARROW_BOX : BOX;
   const arrows = new Map();
   for (const link of links) {
     if (!arrows.has(link.arrow)) arrows.set(link.arrow, { sender: link.sender, receiver: link.receiver });
   }
-  const { places, height } = placeNodes(names, [...arrows.values()], width, BOX);
+  const { places, height } = placeNodes(names, [...arrows.values()], width, box);
   setAttribute(svg, "viewBox", `0 0 ${width} ${height}`);
   setAttribute(svg, "height", height);
   const head = (id, className) => s("marker", { id, class: className, viewBox: "0 0 10 10", refX: "9", refY: "5", markerWidth: "7", markerHeight: "7", orient: "auto" }, s("path", { d: "M0 0L10 5L0 10z" }));
   svg.replaceChildren(s("defs", {}, head("head", "head"), head("head-warn", "head warn"), head("head-alarm", "head alarm")));
   for (const [key, arrow] of arrows) {
-    const { path, x, y } = routeArrow(places.get(arrow.sender), places.get(arrow.receiver), arrows.has(`${arrow.receiver}→${arrow.sender}`), BOX);
+    const { path, x, y } = routeArrow(places.get(arrow.sender), places.get(arrow.receiver), arrows.has(`${arrow.receiver}→${arrow.sender}`), box);
     arrow.path = s("path", { d: path, class: "arrow" });
     arrow.title = s("title");
     arrow.first = s("tspan", { x, dy: "-0.1em" });
@@ -123,20 +135,27 @@ function draw(svg, names, links, width, shape) {
   for (const name of names) {
     const { x, y } = places.get(name);
     const state = s("text", { x, y: y + 14, class: "state" });
-    const box = s("rect", { x: x - BOX.width / 2, y: y - BOX.height / 2, width: BOX.width, height: BOX.height, rx: 4 });
-    const label = s("text", { x, y: y - 5, class: "name" }, name);
-    const group = s("a", { class: "node" }, box, label, state);
+    const frame = s("rect", { x: x - box.width / 2, y: y - box.height / 2, width: box.width, height: box.height, rx: 4 });
+    const most = Math.floor((MOST_LETTERS * box.width) / BOX.width);
+    const label = s("text", { x, y: y - 5, class: "name" }, name.length > most ? `${name.slice(0, most - 1)}…` : name);
+    const group = s("a", { class: "node" }, s("title", {}, name), frame, label, state);
     nodes.set(name, { group, state });
     svg.append(group);
   }
   return { shape, arrows, nodes, hasRoom: width >= NARROW };
 }
 
+/** Return whether all slaves of a station are in OP, by the text of its buses. */
+function hasWholeBuses(text) {
+  const counts = [...text.matchAll(/(\d+)\/(\d+) OP/g)];
+  return !/down|cut|\?/.test(text) && counts.every(([, op, all]) => op === all);
+}
+
 function update({ arrows, nodes, hasRoom }, message, links, losses) {
   const stations = new Map(message.stations.map((each) => [each.name, each]));
   for (const [name, node] of nodes) {
     const station = stations.get(name);
-    const isWell = station?.state === "OP" && !/down|cut/.test(station.bus);
+    const isWell = station?.state === "OP" && hasWholeBuses(station.bus);
     const text = station ? [tn("state", station.state), station.bus].filter(Boolean).join(" · ") : t("not_of_the_plant");
     setText(node.state, station && !isWell ? `▲ ${text}` : text);
     setAttribute(node.group, "class", station ? (isWell ? "node" : "node warn") : "node foreign");

@@ -40,9 +40,10 @@ export function findingsPanel(panel, scope) {
   const rows = new Rows(body);
   const none = h("p", { class: "note" }, t("no_findings"));
   scope.on("plant", ({ findings }) => {
-    none.hidden = findings.length > 0;
-    frame.hidden = !findings.length;
-    rows.show(findings, (each) => `${each.where} ${each.what}`, (each) => [severityCell(each.severity), each.where ?? "", each.what ?? "", each.advice ?? ""]);
+    const shown = findings.filter((each) => each.severity !== "info"); // those are counts
+    none.hidden = shown.length > 0;
+    frame.hidden = !shown.length;
+    rows.show(shown, (each) => `${each.where} ${each.what}`, (each) => [severityCell(each.severity), each.where ?? "", each.what ?? "", each.advice ?? ""]);
   });
   return h("div", {}, none, frame);
 }
@@ -53,11 +54,16 @@ export function busPanel(panel, scope) {
   const parts = new Map();
   const none = h("p", { class: "note" }, t("no_buses"));
   element.append(none);
-  scope.on("plant", ({ buses }) => {
+  scope.on("plant", ({ buses, stations }) => {
     const shown = Object.entries(buses).filter(([name]) => matchesAny(panel.of, name));
-    none.hidden = shown.length > 0;
+    // While no engine answers, nothing is known of the buses of a station: their text is "?".
+    const silent = new Set(stations.filter((each) => each.bus.includes("?")).map((each) => each.name));
     for (const name of [...parts.keys()]) {
       if (shown.some(([each]) => each === name)) continue;
+      if (silent.has(stationOf(name))) {
+        parts.get(name).showSilent();
+        continue;
+      }
       parts.get(name).section.remove();
       parts.delete(name);
     }
@@ -65,14 +71,16 @@ export function busPanel(panel, scope) {
       if (!parts.has(name)) parts.set(name, busPart(name, element));
       parts.get(name).show(bus);
     }
+    none.hidden = parts.size > 0;
   });
   return element;
 }
 
 function busPart(name, parent) {
-  const state = h("p", { class: "bus-state" });
+  const state = h("p", { class: "note" });
+  const faults = h("ul", { class: "faults" });
   const { frame, body } = table(t("slaves_of", { bus: name }), [t("address"), t("slave"), t("state"), t("fault")], { class: "slaves" });
-  const section = h("section", {}, h("h3", {}, h("a", { href: hrefOf("station", stationOf(name)) }, name)), state, frame);
+  const section = h("section", {}, h("h3", {}, h("a", { href: hrefOf("station", stationOf(name)) }, name)), state, faults, frame);
   const rows = new Rows(body);
   parent.append(section);
   const show = (bus) => {
@@ -80,23 +88,36 @@ function busPart(name, parent) {
     const inOp = present.filter((slave) => slave.state === "OP").length;
     const isCut = bus.ring?.is_whole === false;
     const facts = [
-      bus.is_up ? t("slaves_in_op", { op: inOp, all: present.length }) : `■ ${t("bus_down")}`,
-      bus.fault && `■ ${bus.fault}`,
-      isCut && `▲ ${t("ring_cut", { between: (bus.ring.between ?? []).map((each) => each ?? "master").join(" – ") })}`,
+      t("slaves_in_op", { op: inOp, all: present.length }),
       t("bus_lost", { lost: bus.lost, wkc: bus.wkc_errors }),
       bus.trip_us != null && t("bus_trip", { trip: formatDuration(bus.trip_us) }),
-      ...bus.findings.map((each) => `■ ${each.what}${each.advice ? `; ${each.advice}` : ""}`),
     ];
     setText(state, facts.filter(Boolean).join(" · "));
-    setAttribute(state, "class", !bus.is_up || bus.fault || bus.findings.length ? "bus-state alarm" : isCut || inOp < present.length ? "bus-state warn" : "bus-state");
+    const between = (bus.ring?.between ?? []).map((each) => each ?? "master").join(" – ");
+    showFaults([
+      !bus.is_up && t("bus_down"),
+      bus.fault,
+      isCut && t("ring_cut", { between }),
+      ...bus.findings.map((each) => (each.advice ? `${each.what}; ${each.advice}` : each.what)),
+    ].filter(Boolean));
+    setAttribute(section, "class", null);
     rows.show(bus.slaves, (slave) => slave.address, (slave) => slaveCells(slave));
   };
-  return { section, show };
+  const showFaults = (texts) => {
+    const shown = texts.map((text) => `■ ${text}`);
+    if (shown.join("\n") === [...faults.children].map((each) => each.textContent).join("\n")) return;
+    faults.replaceChildren(...shown.map((text) => h("li", {}, text)));
+  };
+  const showSilent = () => {
+    showFaults([t("bus_silent")]);
+    setAttribute(section, "class", "silent");
+  };
+  return { section, show, showSilent };
 }
 
 function slaveCells(slave) {
   const isWell = slave.is_absent || (slave.state === slave.target && !slave.fault);
-  const state = slave.is_absent ? t("not_plugged_in") : (slave.state ?? t("lost"));
+  const state = slave.is_absent ? t("not_plugged_in") : (slave.state ?? t("slave_silent"));
   const target = !isWell && slave.target !== slave.state ? ` (${t("wanted", { state: slave.target })})` : "";
   return [String(slave.address), slave.name, { text: `${isWell ? "" : "▲ "}${state}${target}`, class: isWell ? "" : "warn" }, slave.fault];
 }

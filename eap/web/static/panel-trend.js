@@ -10,6 +10,7 @@ import { pathOf } from "./panel-set.js";
 const COLORS = 8;
 const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3]];
 const HEIGHT = 230;
+const MIN_PERIOD_MS = 200;
 
 const color = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
@@ -37,7 +38,7 @@ export function trendPanel(panel, scope) {
     plot ??= makePlot(plotFrame, names, panel, range, readings);
     plot.setData(curves.arrays(latest));
   };
-  const periodMs = Math.min(1000, Math.max(100, (windowS * 1000) / 600));
+  const periodMs = Math.min(1000, Math.max(MIN_PERIOD_MS, (windowS * 1000) / 600));
   let frame = 0;
   const drawSoon = () => {
     if (frame || performance.now() - drawnAt < periodMs - 20) return;
