@@ -88,6 +88,10 @@ export function trendPanel(panel, scope) {
   scope.listen(matchMedia("(prefers-color-scheme: dark)"), "change", redraw);
   scope.listen(matchMedia("print"), "change", redraw);
   scope.listen(document, "visibilitychange", draw);
+  scope.listen(window, "beforeprint", () => {
+    isShown = true; // paper has all panels
+    draw();
+  });
   scope.atEnd(() => {
     width.disconnect();
     visible.disconnect();
