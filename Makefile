@@ -50,12 +50,13 @@ test-tools: setup  ## run the tests of tools/: fuzz targets, page of faults, ben
 properties: setup  ## run the property tests with all their examples; make test takes a quarter
 	@$(PYTEST) -m hypothesis --hypothesis-profile=full tests $(ARGS)
 
-check: setup  ## format, lint, types, import contracts, tree
+check: setup  ## format, lint, types, import contracts, tree, and whether each test can be imported
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python tools/check_tree.py
+	@found=$$($(BIN)/python -m pytest --collect-only -qqq tests 2>&1) || { echo "$$found"; exit 1; }
 
 structure: setup  ## count modules, code lines, names, tests, and modules that a request passes (up to a minute)
 	@sh tools/isolated.sh $(BIN)/python -m tools.structure --paths $(ARGS)

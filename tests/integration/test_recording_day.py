@@ -13,7 +13,7 @@ import pytest
 
 from eap.pd.framering import HEADER_SIZE, FrameRingReader, FrameRingWriter, RingHeader
 from eap.pd.layout import plan_layout
-from eap.recording.capture import Block
+from eap.recording.capture import CapturedBlock
 from eap.recording.files import DiskFullError, FileSequence, RecordingFile, room_on
 from eap.recording.header import RecordingHeader
 from eap.recording.recording_file import describe, open_recording
@@ -41,23 +41,23 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", str(tmp_path)], check=True)
 
 
-def values(number: int, time_ns: int) -> Block:
+def values(number: int, time_ns: int) -> CapturedBlock:
     """One sample of numbers that do not become smaller by compression."""
     data = number.to_bytes(8, "little") + time_ns.to_bytes(8, "little") + os.urandom(SAMPLE)
-    return Block(LAYOUT.station, time_ns, time_ns, data, SAMPLE)
+    return CapturedBlock(LAYOUT.station, time_ns, time_ns, data, SAMPLE)
 
 
-def frames() -> Callable[[int, int], Block]:
+def frames() -> Callable[[int, int], CapturedBlock]:
     memory = memoryview(bytearray(HEADER_SIZE + (1 << 20)))
     header = RingHeader.format(memory)
     header.capacity = 1 << 20
     writer, reader = FrameRingWriter(header, memory), FrameRingReader(header, memory)
     writer.number("s/eap0")
 
-    def block(number: int, time_ns: int) -> Block:
+    def block(number: int, time_ns: int) -> CapturedBlock:
         writer.add(0, time_ns, 0, memoryview(os.urandom(900)))
         (run,) = reader.runs()
-        return Block("", time_ns, time_ns, run.octets)
+        return CapturedBlock("", time_ns, time_ns, run.octets)
 
     return block
 
@@ -70,7 +70,9 @@ def make_frames(path: Path, time_ns: int) -> RecordingFile:
     return FramesSink(path, HEADER, [LAYOUT], (), lambda: ["s/eap0"])
 
 
-def record_day(files: FileSequence, make: Callable, block: Callable[[int, int], Block]) -> int:
+def record_day(
+    files: FileSequence, make: Callable, block: Callable[[int, int], CapturedBlock]
+) -> int:
     """Record a day, with a flush each minute; return the most bytes there were."""
     most = 0
     for number in range(HOURS * 3600 // STEP_S):
@@ -135,13 +137,13 @@ def _fill(file: RawIOBase) -> None:
             file.write(bytes(4096))
 
 
-def _write_on(files: FileSequence, block: Callable[[int, int], Block]) -> None:
+def _write_on(files: FileSequence, block: Callable[[int, int], CapturedBlock]) -> None:
     for number in range(600, 10_000):
         files.write(block(number, START_NS + number * S))
         files.flush()
 
 
-def _kind(kind: str) -> tuple[str, Callable, Callable[[int, int], Block]]:
+def _kind(kind: str) -> tuple[str, Callable, Callable[[int, int], CapturedBlock]]:
     return (
         (".mcap", make_values, values) if kind == "values" else (".pcapng", make_frames, frames())
     )
