@@ -67,5 +67,5 @@ bench: .venv/.stamp-bench  ## measure speed and memory (as root for everything; 
 
 clean:  ## remove .venv and everything that was generated
 	rm -rf .venv build dist *.egg-info .coverage .hypothesis .import_linter_cache \
-		.mypy_cache .pytest_cache .ruff_cache
+		.mypy_cache .pytest_cache .ruff_cache tests/peers/node_modules
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

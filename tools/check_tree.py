@@ -119,7 +119,11 @@ def _walk(root: Path) -> list[PurePosixPath]:
 def _is_generated(part: str) -> bool:
     if part in {".ci", ".gitignore"}:
         return False
-    return part.startswith(".") or part in {"__pycache__", "build", "dist"} or "egg-info" in part
+    return (
+        part.startswith(".")
+        or part in {"__pycache__", "build", "dist", "node_modules"}
+        or "egg-info" in part
+    )
 
 
 def check(root: Path) -> list[Violation]:

@@ -1,6 +1,7 @@
 #!/bin/sh
-# Makes sure of the Debian programs that a group of commands meets as peers or builds its networks with.
-# Usage: tools/install_peers.sh test|bench      Exit status 1 when something is still missing.
+# Makes sure of the Debian programs that a group of commands meets as peers or builds its networks with;
+# for tests also of npm packages.
+# Usage: tools/install_peers.sh test|bench      Exit status 1 when a program is still missing.
 set -eu
 here=$(dirname "$0")
 case ${1:-} in
@@ -17,6 +18,8 @@ packages=""
 for pair in $wanted; do
     PATH=$PATH:/usr/sbin:/sbin command -v "${pair%%=*}" >/dev/null || packages="$packages ${pair#*=}"
 done
+# Without npm packages, for which some machines have no registry, only few tests are skipped.
+[ "$1" = bench ] || sh "$here/npm_peers.sh" || :
 [ -n "$packages" ] || exit 0
 # shellcheck disable=SC2086  # a list of package names
 exec sh "$here/apt.sh" "make $1" $packages

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
-import os
-import shutil
 import subprocess
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,6 +14,7 @@ from eap.codec.adssymbol import DataTypeEntry, DataTypeFlag, UploadInfo
 from tests.support.adslib import open_connection
 from tests.support.adstypes import decode_types
 from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
+from tests.support.npm import needs_npm, node_environment
 
 pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
 
@@ -322,8 +320,6 @@ def test_member_is_notified_when_it_changes(tower) -> None:
         tower.del_device_notification(*others)
 
 
-NODE_MODULES = os.environ.get("EAP_NODE_MODULES", "")
-"""Folder with the npm package ads-client, which is not part of the project."""
 LONG = ["lword", "lint", "ulint", "ltime", "ldate", "ltod", "ldt"]
 CLIENT = """
 const { Client } = require("ads-client");
@@ -373,10 +369,7 @@ function plain(_, value) { return typeof value == "bigint" ? String(value) : val
 """
 
 
-@pytest.mark.skipif(
-    not shutil.which("node") or not (Path(NODE_MODULES) / "ads-client").is_dir(),
-    reason="needs node, and EAP_NODE_MODULES with ads-client: npm install ads-client",
-)
+@needs_npm("ads-client")
 def test_ads_client_reads_and_writes_structs_as_objects(appliance, types) -> None:
     given = VALUES | {name: str(VALUES[name]) for name in LONG}  # JavaScript's BigInt
     words = [
@@ -396,7 +389,7 @@ def test_ads_client_reads_and_writes_structs_as_objects(appliance, types) -> Non
         text=True,
         timeout=60,
         check=False,
-        env={**os.environ, "NODE_PATH": NODE_MODULES},
+        env=node_environment(),
     )
     assert done.returncode == 0, done.stderr
     seen = json.loads(done.stdout)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ import pytest
 
 from eap.codec.ads import AdsRange
 from tests.support.appliance import Appliance, plants, wait_until
+from tests.support.npm import needs_npm, node_environment
 from tests.support.slavetool import SDO, SOE, Slave
 
 pyads = pytest.importorskip("pyads", reason="needs pyads: pip install pyads")
@@ -242,8 +242,6 @@ def test_objects_of_slaves_are_watched_by_several_clients(plant: Appliance, via:
         assert refused.value.err_code == 0x70C
 
 
-NODE_MODULES = os.environ.get("EAP_NODE_MODULES", "")
-"""Folder with the npm package ads-client, which is not part of the project."""
 SUBSCRIBER = """
 const { Client } = require("ads-client");
 const [netId, port, address] = process.argv.slice(1);
@@ -267,10 +265,7 @@ const client = new Client({
 """
 
 
-@pytest.mark.skipif(
-    not shutil.which("node") or not (Path(NODE_MODULES) / "ads-client").is_dir(),
-    reason="needs node, and EAP_NODE_MODULES with ads-client: npm install ads-client",
-)
+@needs_npm("ads-client")
 @pytest.mark.parametrize("via", [MILL, SAW])
 def test_ads_client_watches_objects_of_slaves(plant: Appliance, via: str) -> None:
     with slave(DRIVE, MILL) as drive:
@@ -281,7 +276,7 @@ def test_ads_client_watches_objects_of_slaves(plant: Appliance, via: str) -> Non
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "NODE_PATH": NODE_MODULES},
+            env=node_environment(),
         ) as node:
             assert node.stdout.readline() == "[500]\n"
             drive.write(*WINDOW, (501).to_bytes(4, "little"))
