@@ -56,6 +56,7 @@ check: setup  ## format, lint, types, import contracts, tree, and whether each t
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python tools/check_tree.py
+	$(BIN)/python -m tools.schema --check
 	@found=$$($(BIN)/python -m pytest --collect-only -qqq tests 2>&1) || { echo "$$found"; exit 1; }
 
 structure: setup  ## count modules, code lines, names, tests, and modules that a request passes (up to a minute)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from eap.cli.group import ExitCode
 from eap.cli.output import Renderer, write_text
@@ -28,15 +29,27 @@ SHAPES = ("ring", "star")
 
 
 @click.command()
-@click.argument("file", type=PLANT_FILE)
+@click.argument("file", type=PLANT_FILE, required=False)
+@click.option(
+    "--schema", is_flag=True, help="Instead: print the JSON Schema of plant files, for editors."
+)
 @json_option("Print one object: ok, all findings, and warnings.")
 @click.pass_context
-def check(ctx: click.Context, file: Path, output: Renderer) -> None:
+def check(ctx: click.Context, file: Path | None, schema: bool, output: Renderer) -> None:
     """Check the plant file or bus file FILE and report all errors.
 
     Exits with 2 when there is an error.  A warning names a part that runs but that some commands do
     not support.
     """
+    if schema:
+        if file is not None:
+            raise click.UsageError("--schema excludes FILE", ctx)
+        from eap.config.new_plant import SCHEMA
+
+        write_text(SCHEMA.read_text(), end="")
+        return
+    if file is None:
+        raise click.UsageError("nothing to check: give FILE, or --schema", ctx)
     from eap.ops.check import CheckedBus, check_file  # yaml; --help must not wait
 
     checked = check_file(file)
@@ -113,23 +126,37 @@ def _summary(file: Path, checked: CheckedPlant | CheckedBus) -> Iterator[str]:
     metavar="MS",
     help="Device cycle in milliseconds.",
 )
-@click.option("--force", is_flag=True, help="Overwrite an existing file.")
-@json_option("Print one object: file, plant and stations.")
+@click.option(
+    "--from",
+    "example",
+    metavar="EXAMPLE",
+    help="Copy an example plant instead, with its bus files: demo, valve, solar-line or another; an"
+    " unknown name lists them.",
+)
+@click.option("--force", is_flag=True, help="Overwrite existing files.")
+@json_option("Print one object: file, plant and stations, or the copied files.")
+@click.pass_context
 def new(
+    ctx: click.Context,
     file: Path,
     count: int,
     shape: str,
     name: str | None,
     address: str,
     cycle_us: int,
+    example: str | None,
     force: bool,
     output: Renderer,
 ) -> None:
     """Write the plant file FILE (- is stdout) with N stations in a ring or a star.
 
     Allocates names, NetIDs, addresses and PD IDs.  The file has explanatory comments, passes
-    'eapctl check' and runs unchanged.
+    'eapctl check' and runs unchanged.  With --from, it is a copy of an example instead.
     """
+    if example is not None:
+        _refuse_shape(ctx)
+        _copy_example(example, name, file, output, force=force)
+        return
     from eap.config.new_plant import NewPlant, Shape, plant_text
     from eap.pd.rules import plant_name_of
 
@@ -154,6 +181,42 @@ def new(
         created,
         lambda _: f"{file}: plant {plant}, {count} stations in a {shape}; eapctl run {file}",
     )
+
+
+_OF_A_SHAPE = ("count", "shape", "address", "cycle_us")
+
+
+def _refuse_shape(ctx: click.Context) -> None:
+    """Raise UsageError if an option beside ``--from`` describes stations."""
+    if any(ctx.get_parameter_source(each) is ParameterSource.COMMANDLINE for each in _OF_A_SHAPE):
+        others = "--stations, --ring, --star, --address and --cycle"
+        raise click.UsageError(f"--from copies an example: omit {others}", ctx)
+
+
+def _copy_example(
+    example: str, name: str | None, file: Path, output: Renderer, *, force: bool
+) -> None:
+    """Write the files of an example; those that are there already with this content stay."""
+    from eap.config.examples import CopiedExample, read_example
+    from eap.pd.rules import plant_name_of
+    from eap.runtime.durable import whole_file
+
+    plant = name or plant_name_of(file.stem)
+    check_new_file(file, force=force)
+    files = read_example(example, plant, file)
+    others = list(files)[1:]
+    for path in others:
+        if path.exists() and path.read_bytes() != files[path] and not force:
+            raise ConfigError(f"{path} exists: overwrite it with --force")
+    for path, content in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as target:
+            target.write(content)
+    beside = list(map(str, others))
+    created = CopiedExample(str(file), plant, example, beside)
+    with_files = f", with {', '.join(beside)}" if beside else ""
+    text = f"{file}: plant {plant}, a copy of the example {example}{with_files}; eapctl run {file}"
+    output.show(created, lambda _: text)
 
 
 def _write(file: Path, text: str, *, force: bool) -> None:

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 from enum import StrEnum
 from ipaddress import IPv4Address
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
@@ -31,6 +32,12 @@ _NAME = re.compile(r"[^\s/]+")
 _PLAIN = re.compile(r"(?!(?:true|false|null)$)[A-Za-z][\w-]*", re.ASCII | re.IGNORECASE)
 """Texts that YAML reads as they are."""
 _INTERFACE = re.compile(r"[\w.@-]{1,15}", re.ASCII)
+
+
+SCHEMA = Path(__file__).resolve().with_name("plant.schema.json")
+"""JSON Schema of plant files, written by ``python -m tools.schema``."""
+SCHEMA_LINE = f"# yaml-language-server: $schema={SCHEMA.as_uri()}"
+"""Comment by which editors find the schema."""
 
 
 class Shape(StrEnum):
@@ -84,8 +91,7 @@ def plant_text(
     Raises:
         ConfigError: the name, the number of stations or the address is invalid.
     """
-    if not _NAME.fullmatch(name):
-        raise ConfigError(f"plant name {name!r}: expected a text without spaces and slashes")
+    line = plant_line(name)
     if not MIN_STATIONS <= count <= MAX_STATIONS:
         raise ConfigError(
             f"{count} stations: a {shape} has {MIN_STATIONS} to {MAX_STATIONS} of them"
@@ -94,10 +100,11 @@ def plant_text(
     draw, stations = (_ring_drawing, _ring) if shape is Shape.RING else (_star_drawing, _star)
     return "\n".join(
         [
+            SCHEMA_LINE,
             *_head(name, shape, places),
             *(f"#   {line}" for line in draw(places)),
             *_usage(places, file),
-            f"plant: {name if _PLAIN.fullmatch(name) else json.dumps(name)}",
+            line,
             f"defaults: {{cycle_us: {cycle_us}}}",
             "",
             *_shared(shape, max(_MIN_TIMEOUT_MS, 5 * cycle_us // 1000)),
@@ -105,6 +112,13 @@ def plant_text(
             *stations(places),
         ]
     )
+
+
+def plant_line(name: str) -> str:
+    """Return the line of a plant file that has the plant's *name*; raise ConfigError if invalid."""
+    if not _NAME.fullmatch(name):
+        raise ConfigError(f"plant name {name!r}: expected a text without spaces and slashes")
+    return f"plant: {name if _PLAIN.fullmatch(name) else json.dumps(name)}"
 
 
 def _place(number: int, address: str, count: int) -> _StationAddress:

@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from eap.cli.group import main
+from eap.config.new_plant import SCHEMA
 
 PLANT = """\
 plant: line
@@ -116,3 +117,15 @@ def test_missing_file_is_one_line(tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert result.stderr.count("\n") == 1
     assert "does not exist" in result.stderr
+
+
+def test_schema_is_printed_as_published() -> None:
+    result = CliRunner().invoke(main, ["check", "--schema"])
+    assert (result.exit_code, result.stdout) == (0, SCHEMA.read_text())
+
+
+@pytest.mark.parametrize(("words", "reason"), [((), "give FILE"), (("--schema", "a"), "excludes")])
+def test_check_without_a_task_names_it(words: tuple[str, ...], reason: str) -> None:
+    result = CliRunner().invoke(main, ["check", *words])
+    assert result.exit_code == 2
+    assert reason in result.stderr

@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from eap.cli.group import main
+from eap.config.examples import example_names
 
 
 @pytest.fixture
@@ -87,3 +88,62 @@ def test_folder_that_is_not_there(run):
     result = run("nowhere/hall.yaml")
     assert result.exit_code == 2
     assert "nowhere/hall.yaml cannot be written: no folder nowhere" in result.stderr
+
+
+@pytest.mark.parametrize("example", example_names())
+def test_example_is_a_plant_in_any_folder(run, tmp_path, example):
+    result = run("hall.yaml", "--from", example)
+    assert result.exit_code == 0, result.stderr
+    assert result.output.startswith(f"hall.yaml: plant hall, a copy of the example {example}")
+    checked = check(tmp_path / "hall.yaml")
+    assert (checked.exit_code, checked.stderr) == (0, "")
+    text = (tmp_path / "hall.yaml").read_text()
+    assert text.startswith("# yaml-language-server: $schema=file:///")
+    assert "config/" not in text.partition("\n")[2]
+
+
+def test_example_comes_with_its_files_in_the_folder_of_the_plant(run, tmp_path):
+    (tmp_path / "line").mkdir()
+    result = run("line/demo.yaml", "--from", "demo", "--name", "north", "--json")
+    assert json.loads(result.stdout) == {
+        "file": "line/demo.yaml",
+        "plant": "north",
+        "example": "demo",
+        "files": [
+            *(f"line/buses/{name}" for name in ("drive.yaml", "coe.yaml", "io.yaml", "level.csv")),
+        ],
+    }
+    assert check(tmp_path / "line/demo.yaml").exit_code == 0
+    again = run("line/other.yaml", "--from", "demo")
+    assert again.exit_code == 0, "files with the same content stay"
+
+
+def test_example_overwrites_nothing_without_force(run, tmp_path):
+    (tmp_path / "buses").mkdir()
+    mine = tmp_path / "buses/drive.yaml"
+    mine.write_text("mine")
+    result = run("hall.yaml", "--from", "demo")
+    assert (result.exit_code, result.stderr) == (
+        2,
+        "buses/drive.yaml exists: overwrite it with --force\n",
+    )
+    assert list(tmp_path.rglob("*.*")) == [mine]
+    assert run("hall.yaml", "--from", "demo", "--force").exit_code == 0
+    assert check(tmp_path / "hall.yaml").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--from", "valves"), "unknown example 'valves', did you mean valve?"),
+        (("--from", "zz"), "known examples: cell, demo, "),
+        (("--from", "../demo"), "unknown example"),
+        (("--from", "demo", "--star"), "omit --stations"),
+        (("--from", "demo", "--name", "a b"), "plant name 'a b'"),
+    ],
+)
+def test_impossible_example_has_its_reason(run, tmp_path, words, reason):
+    result = run("hall.yaml", *words)
+    assert result.exit_code == 2
+    assert reason in result.stderr
+    assert not list(tmp_path.iterdir())
