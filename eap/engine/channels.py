@@ -144,6 +144,23 @@ class PortChannels:
 
     def enter(self, opened: OpenedPort) -> None:
         """Receive frames for a port from now on."""
+        self.exchange((), (opened,))
+
+    def exchange(self, gone: Iterable[PortName], added: Iterable[OpenedPort]) -> None:
+        """Receive for ports that are added from now on, and for those that are gone no more.
+
+        Connections of the latter end; what a port of either kind uses stays open.
+        """
+        keys: dict[SharedSocket, None] = {}
+        for name in gone:
+            keys.update(dict.fromkeys(self._leave(name)))
+        for opened in added:
+            self._join(opened)
+            keys.update(dict.fromkeys(opened.sockets))
+        for key in keys:
+            self._follow_users(key)
+
+    def _join(self, opened: OpenedPort) -> None:
         self._ports[opened.name] = opened
         datagrams = opened.datagrams
         if isinstance(datagrams, EthernetPort):
@@ -156,16 +173,14 @@ class PortChannels:
             group.handlers.append(opened.handler)
         if opened.tcp is not None:
             self.enter_tcp(opened.name, opened.tcp)
-        for key in opened.sockets:
-            self._follow_users(key)
 
     def enter_tcp(self, name: PortName, tcp: TcpPort) -> None:
         """Take connections for a port that had no TCP before."""
         self._tcp[name] = tcp
         self._feeds[name] = DropCounterFeed(self._counters, [name.station], tcp.closed, _tcp_reason)
 
-    def remove(self, name: PortName) -> None:
-        """Receive nothing for a port any more; close its connections, and what no port shares."""
+    def _leave(self, name: PortName) -> tuple[SharedSocket, ...]:
+        """Receive nothing for a port any more and close its connections; return its sockets."""
         opened = self._ports.pop(name)
         datagrams = opened.datagrams
         if isinstance(datagrams, EthernetPort):
@@ -181,8 +196,7 @@ class PortChannels:
             self._feeds.pop(name).publish()
         for other in self._tcp.values():
             other.forget(opened.handler)
-        for key in opened.sockets:
-            self._follow_users(key)
+        return opened.sockets
 
     def has_tcp(self, name: PortName) -> bool:
         """Return whether a port takes connections, or has some."""

@@ -153,11 +153,8 @@ class StationReplacement:
         channels, name = entry.channels, station.spec.name
         # Recordings take the new ports up by themselves.
         before.untap([port.name for port in self._changes.gone])
-        for port in self._changes.gone:
-            channels.remove(PortName(name, port.name))
         station.follow(before, now_ns)
-        for opened in self._opened:
-            channels.enter(opened)
+        channels.exchange([PortName(name, port.name) for port in self._changes.gone], self._opened)
         for port_name, tcp in self._tcp_ports.items():
             channels.enter_tcp(PortName(name, port_name), tcp)
         for bus, mapping in self._mappings:
@@ -253,14 +250,16 @@ class _Job:
         """Swap in the replacement, if there is one; note whether it has to be built again."""
         self.is_built = False
         successor = self.successor
-        if successor is not None:
-            self.is_stale = not successor.is_current
-            if self.is_stale:
-                successor.discard()  # PDs that shared an account have parted meanwhile
-            else:
-                self._put(successor, engine, now_ns)
-        self.entry.channels.update_tcp(self.entry.station)
-        self._taken.release()
+        try:
+            if successor is not None:
+                self.is_stale = not successor.is_current
+                if self.is_stale:
+                    successor.discard()  # PDs that shared an account have parted meanwhile
+                else:
+                    self._put(successor, engine, now_ns)
+            self.entry.channels.update_tcp(self.entry.station)
+        finally:
+            self._taken.release()  # an engine that fails here would wait for its thread forever
 
     def abandon(self) -> None:
         """Abandon the job without a swap."""

@@ -113,6 +113,9 @@ def make_plan(
         read_back(wanted, fresh)
     except DeviceFault as exc:
         return Plan(wanted, [], [], [str(exc)], {})
+    except LookupError as exc:
+        reason = f"the specification of {wanted.name} refers to {exc}, which it does not describe"
+        return Plan(wanted, [], [], [reason], {})
     changes = [
         (name, change)
         for name, new in fresh.items()

@@ -75,6 +75,9 @@ FIRST = plant_text()
 LOOP = plant_text("loop://second", "loop://second")
 UDP = plant_text("udp://127.9.94.11", "udp://127.9.94.12")
 MOVED = plant_text("udp://127.9.94.21", "udp://127.9.94.22")
+TAKING_TCP = plant_text(
+    "udp://127.9.94.11", "udp://127.9.94.12", more=', tcp: true, join: ["239.1.2.3"]'
+)
 WAKING = plant_text("udp://127.9.94.11", "udp://127.9.94.12", more=", wake: arrival, ams: false")
 
 
@@ -165,6 +168,8 @@ def test_ports_come_change_and_go_while_another_loses_nothing(plant: Plant) -> N
     assert "* port eap1: added at udp://127.9.94.12" in plan
     assert plant.addresses() == {OVEN, PANEL}
     for text, there in (
+        (UDP, {"127.9.94.11", "127.9.94.12"}),
+        (TAKING_TCP, {"127.9.94.11", "127.9.94.12"}),
         (UDP, {"127.9.94.11", "127.9.94.12"}),
         (MOVED, {"127.9.94.21", "127.9.94.22"}),
         (LOOP, set[str]()),

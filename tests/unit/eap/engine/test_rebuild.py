@@ -300,6 +300,18 @@ def test_states_change_while_cycles_run(running):
     assert str(running.answers[number]) == "there is no station nobody"
 
 
+def test_engine_whose_swap_fails_ends_for_its_new_start(tmp_path, monkeypatch):
+    running = Running(tmp_path)
+
+    def fail(self, path):
+        raise RuntimeError("no error that a swap knows")
+
+    monkeypatch.setattr(ImageFile, "move_to", fail)
+    with pytest.raises(RuntimeError):
+        running.configure(wider(running.left))
+    running.plant.close()  # waits for the thread that built
+
+
 def test_rebuilder_close_waits_for_build(tmp_path):
     running = Running(tmp_path)
     running.post(wider(running.left))
