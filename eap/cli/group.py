@@ -182,6 +182,7 @@ _COMMANDS = {
     "gateway": ("gateway:gateway", "Start, stop and show the mailbox gateways of a station."),
     "gw": ("gateway:gw", "Access a master and its slaves through any mailbox gateway."),
     "import": ("files:import_files", "Make a plant file of TwinCAT, ENI and ESI files."),
+    "inventory": ("inventory:inventory", "Print the hosts of a plant file for Ansible."),
     "new": ("plant:new", "Write a plant file to start from."),
     "od": ("od:od", "Read and write the object dictionary of a device."),
     "pd": ("pd:pd", "List, watch and set the process data of running stations."),

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 
 SHAPES = ("ring", "star")
+HOST_VARIABLE = "EAP_HOST"
+"""Name of the host that this computer is, for commands without --host."""
 
 
 @click.command()
@@ -510,6 +512,14 @@ def _blank_options(command: CommandT) -> CommandT:
     metavar="NAME",
     help="Run only this station; repeatable.",
 )
+@click.option(
+    "--host",
+    envvar=HOST_VARIABLE,
+    default="",
+    metavar="NAME",
+    help="Run the stations of this host of PLANT; by default of the one whose name or address this"
+    f" computer has, or that {HOST_VARIABLE} names.",
+)
 @_blank_options
 @click.option(
     "--realtime/--no-realtime",
@@ -532,6 +542,7 @@ def run(
     ctx: click.Context,
     plant: Path | None,
     stations: tuple[str, ...],
+    host: str,
     realtime: bool,
     priority: int,
     cpu: int | None,
@@ -546,6 +557,8 @@ def run(
     With --blank, run one station that has a single EAP port, in PREOP; 'eapctl od write', 'eapctl
     apply' or another tool configures it.
 
+    Of a plant with hosts, the stations of one host run: docs/several-hosts.md.
+
     Prints one line {"ready": true, "stations": [...]} on stdout when each station has run its first
     cycle; messages go to stderr.  Exits with 2, and starts nothing, when the plant file has errors
     or this host lacks an address, interface or permission.
@@ -558,7 +571,7 @@ def run(
 
     options = EngineOptions(realtime=realtime, priority=priority, cpu=-1 if cpu is None else cpu)
     if plant is not None:
-        ctx.exit(supervisor.run(plant, stations, options=options))
+        ctx.exit(supervisor.run(plant, stations, host=host, options=options))
     station = _blank_plant(blank or "", interface or "", net_id or "", cycle_us or DEFAULT_CYCLE_US)
     ctx.exit(supervisor.run_blank(station, options=options, resume=resume))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from ipaddress import IPv4Address
 from itertools import count
 from math import lcm
 from types import MappingProxyType
@@ -300,6 +301,24 @@ class Index:
             if (uri := _interface(port.interface)) is not None
         }
         self.sent = _first(((s.station.name, s.pd.name), s) for s in self._sent())
+        self.hosts = _first((name, host) for host in plant.hosts for name in host.stations)
+        """Host of each station, by its name; empty for a plant of one host."""
+
+    def are_apart(self, station: str, other: str) -> bool:
+        """Return whether two stations run on different hosts."""
+        one, two = self.hosts.get(station), self.hosts.get(other)
+        return one is not None and two is not None and one.name != two.name
+
+    def interface(self, station: str, port: str) -> InterfaceUri:
+        """Return the interface of a port by the name that the host of its station has for it."""
+        return self.interface_on_host(station, self.uris[station, port])
+
+    def interface_on_host(self, station: str, uri: InterfaceUri) -> InterfaceUri:
+        """Return *uri* of the file by the name that the host of *station* has for it."""
+        host = self.hosts.get(station)
+        if host is None or uri.scheme != "ethernet":
+            return uri
+        return InterfaceUri(uri.scheme, host.interface(uri.host), uri.port, uri.options)
 
     def cycle_us(self, station: StationSection) -> int:
         """Return the device cycle of *station*."""
@@ -431,6 +450,13 @@ def _interface(text: str) -> InterfaceUri | None:
         return InterfaceUri.parse(text)
     except ValueError:
         return None
+
+
+def is_local_only(uri: InterfaceUri) -> bool:
+    """Return whether only the own host reaches *uri*: a loopback line or address."""
+    if uri.scheme == "loop":
+        return True
+    return uri.scheme in {"udp", "tcp"} and IPv4Address(uri.host).is_loopback
 
 
 def _first(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, _Value]:

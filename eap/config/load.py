@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from eap.ams.spec import (
     AmsUser,
@@ -46,9 +47,10 @@ from eap.config.document import convert, read, read_net_id
 from eap.config.eoe import check_eoe, eoe_spec
 from eap.config.exchange import check_polls, check_publish, check_subscribe
 from eap.config.finding import FindingReport, PlantFinding
+from eap.config.hosts import check_hosts, is_served_on
 from eap.config.index import Index, SentPd, VariablePart
 from eap.config.links import check_links, ends, execution_order, is_bitwise
-from eap.config.plant_sections import PlantFile
+from eap.config.plant_sections import HostSection, PlantFile
 from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
 from eap.config.routes import (
     check_routes,
@@ -306,7 +308,7 @@ def _port(index: Index, station: StationSection, port: PortSection) -> PortSpec:
     return PortSpec(
         name=port.name,
         kind=port.kind,
-        interface=index.uris[station.name, port.name],
+        interface=index.interface(station.name, port.name),
         net_id=port.net_id,
         vlan_id=port.vlan_id,
         vlan_priority=port.vlan.priority if port.vlan else 0,
@@ -322,7 +324,7 @@ def _port(index: Index, station: StationSection, port: PortSection) -> PortSpec:
 
 
 def _bus_port(index: Index, station: StationSection, port: PortSection, folder: Path) -> PortSpec:
-    uri = index.uris[station.name, port.name]
+    uri = index.interface(station.name, port.name)
     file = bus_file(port, folder)[1]
     path = "" if file is None else str(file.resolve())
     bus = index.buses[station.name, port.name]
@@ -338,7 +340,7 @@ def _bus_port(index: Index, station: StationSection, port: PortSection, folder: 
             port.clocks,
             port.frame_timeout_us,
             port.frame_retries,
-            port.redundant,
+            _second_line(index, station, port),
             locked_port(index, station) == port.name,
             port.sync_lead_us,
             bus.digest if uri.scheme == "sim" else "",
@@ -346,6 +348,12 @@ def _bus_port(index: Index, station: StationSection, port: PortSection, folder: 
         gateway=gateway_spec(index, station, port),
         eoe=eoe_spec(port),
     )
+
+
+def _second_line(index: Index, station: StationSection, port: PortSection) -> str:
+    if not port.redundant:
+        return ""
+    return str(index.interface_on_host(station.name, InterfaceUri.parse(port.redundant)))
 
 
 def _group(text: str) -> str:
@@ -399,7 +407,7 @@ def derive_directory(index: Index) -> tuple[DirectoryStation, ...]:
                     name=port.name,
                     is_bus=port.kind is PortKind.BUS,
                     net_id=port.net_id,
-                    interface=index.uris[station.name, port.name],
+                    interface=index.interface(station.name, port.name),
                     slaves={
                         slave.name: slave.station for slave in index.slaves(station, port.name)
                     },
@@ -475,10 +483,22 @@ class Plant(msgspec.Struct, frozen=True):
     """Names of the stations, ports and slaves of the plant."""
     audit_required: bool = False
     """True if changes that cannot be recorded are refused."""
+    hosts: tuple[HostSection, ...] = ()
+    """Computers that run the stations; empty for a plant of one."""
     web: WebSection | None = None
     """Page for browsers, with resolved paths; None without one."""
     metrics: MetricsSection | None = None
     """Metrics without a page, with resolved paths; None without them."""
+
+    def on_host(self, host: HostSection) -> Plant:
+        """Return the part of the plant that *host* runs: its stations, and the servers it has."""
+        web, metrics = self.web, self.metrics
+        return replace(
+            self,
+            stations=tuple(each for each in self.stations if each.name in host.stations),
+            web=web if web is None or is_served_on(host, web.listen) else None,
+            metrics=metrics if metrics is None or is_served_on(host, metrics.listen) else None,
+        )
 
 
 class PlantResult(msgspec.Struct, frozen=True):
@@ -519,6 +539,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
     check_discovery(index, report)
     check_access(index, report, path.parent)
     check_web(index, report, path.parent)
+    check_hosts(index, report)
     # Derived only from a plant without findings, so nothing below can fail.
     if findings := report.findings():
         return PlantResult(None, findings)
@@ -528,6 +549,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
         derive_routing(index, path.parent),
         derive_directory(index),
         audit_required=plant_file.access.audit is AuditMode.REQUIRED,
+        hosts=plant_file.hosts,
         web=plant_file.web and resolved(plant_file.web, path.parent),
         metrics=plant_file.metrics and resolved_tls(plant_file.metrics, path.parent),
     )

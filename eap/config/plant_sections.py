@@ -8,6 +8,21 @@ from eap.config.structs import Defaults, PlantAccess, Section, StationSection, T
 from eap.config.web_sections import MetricsSection, WebSection
 
 
+class HostSection(Section, frozen=True, kw_only=True):
+    """A computer of the plant, and the stations that it runs."""
+
+    name: str
+    address: str
+    stations: tuple[str, ...]
+    addresses: tuple[str, ...] = ()
+    user: str = ""
+    interfaces: dict[str, str] = msgspec.field(default_factory=dict)
+
+    def interface(self, name: str) -> str:
+        """Return the name that this host has for the Ethernet interface *name* of the file."""
+        return self.interfaces.get(name, name)
+
+
 class PlantFile(Section, frozen=True, kw_only=True):
     """The whole file; top-level keys that begin with ``x-`` are free for anchors."""
 
@@ -18,5 +33,6 @@ class PlantFile(Section, frozen=True, kw_only=True):
     types: dict[str, TypeSection] | tuple[str | dict[str, TypeSection], ...] = msgspec.field(
         default_factory=dict
     )
+    hosts: tuple[HostSection, ...] = ()
     web: WebSection | None = None
     metrics: MetricsSection | None = None

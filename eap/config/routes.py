@@ -16,7 +16,7 @@ from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
 from eap.config.brokers import HOST, brokers_of, check_brokers, find_network
 from eap.config.finding import FindingReport, PlantFinding, one_of
-from eap.config.index import Index
+from eap.config.index import Index, is_local_only
 from eap.config.structs import RouteSection, StationSection
 from eap.ids import (
     STATION_OCTETS,
@@ -335,6 +335,8 @@ def _hop(
     With *is_wanted* the file names the port, so that the names of the interfaces may differ.
     """
     uri, target = index.uris[own], index.uris[other]
+    if index.are_apart(own[0], other[0]) and (is_local_only(uri) or is_local_only(target)):
+        return None
     if uri.scheme in _IP_SCHEMES and target.scheme in _IP_SCHEMES:
         hop = ip_hop(own[1], uri, target)
         bits = (int(read_address(uri.host)) ^ int(read_address(target.host))).bit_length()

@@ -67,6 +67,8 @@ class ApplianceInfo(msgspec.Struct):
     """Optional processes, such as ``web``."""
     audit_required: bool = False
     """True if changes that cannot be recorded fail."""
+    host: str = ""
+    """Host of the plant that this computer is; empty without ``hosts``."""
 
 
 def runtime_root() -> Path:

@@ -42,12 +42,11 @@ from eap.runtime.handover import (
     SegmentHandover,
     WebHandover,
 )
-from eap.runtime.plantfile import load_plant
 from eap.runtime.socket_plan import require_own_buses
 from eap.runtime.startup import catch_end_signals
 from eap.runtime.store import StationStore, adopt_plant_file, effective
-from eap.suggest import suggest
 from eap.supervisor.child import Child, OutputHandler, StartEvent, describe_end
+from eap.supervisor.part import load_part
 from eap.supervisor.sockets import (
     SharedSockets,
     UnavailableSocketError,
@@ -71,9 +70,12 @@ def run(
     plant_file: Path,
     stations: Sequence[str] = (),
     *,
+    host: str = "",
     options: EngineOptions = EngineOptions(),  # noqa: B008  frozen
 ) -> int:
     """Run the plant in *plant_file*, or only some of its *stations*, until a stop signal.
+
+    Of a plant with several hosts, the stations of *host* run, or of the one that this computer is.
 
     Returns:
         The exit code: 0 after a stop signal, 1 or 2 when it could not start.
@@ -82,13 +84,13 @@ def run(
         ConfigError: the file is no plant; one line a finding.
         EnvironmentalError: this machine lacks something that the plant needs.
     """
-    plant = _load(plant_file)
-    chosen = _choose(plant, stations)
-    require_own_buses(chosen)
-    subset = [station.name for station in chosen] if stations else []
-    info = make_info(plant.name, str(plant_file.resolve()), chosen)
+    plant, own = load_part(plant_file, stations, host)
+    require_own_buses(plant.stations)
+    subset = [station.name for station in plant.stations] if stations or own else []
+    info = make_info(plant.name, str(plant_file.resolve()), plant.stations)
+    info.host = own
     with _claim(folder_name(plant.name, subset)) as folder:
-        return _run(info, replace(plant, stations=chosen), folder, options)
+        return _run(info, plant, folder, options)
 
 
 def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> int:
@@ -153,22 +155,6 @@ def _log_stored_differences(plant: str, stations: Sequence[StationSpec]) -> None
                 kept.state.name,
                 spec.name,
             )
-
-
-def _load(plant_file: Path) -> Plant:
-    result = load_plant(plant_file)
-    if result.plant is None:
-        raise ConfigError("\n".join(str(finding) for finding in result.findings))
-    return result.plant
-
-
-def _choose(plant: Plant, wanted: Sequence[str]) -> tuple[StationSpec, ...]:
-    known = [station.name for station in plant.stations]
-    for name in wanted:
-        if name not in known:
-            hint = suggest(name, known) or f": it has {', '.join(known)}"
-            raise ConfigError(f"plant {plant.name} has no station {name!r}{hint}")
-    return tuple(s for s in plant.stations if not wanted or s.name in wanted)
 
 
 class Supervisor:
