@@ -17,7 +17,7 @@ from msgspec.structs import replace
 import eap
 from eap.errors import EapError
 from eap.ids import InterfaceUri, decode_value, encode_value
-from eap.pd.spec import StationSpec, TxFrameSpec, TxPdSpec, VariableSpec
+from eap.pd.spec import LengthCheck, StationSpec, TxFrameSpec, TxPdSpec, VariableSpec, Wake
 from eap.runtime.folder import VARIABLE
 from tests.support.addresses import own_address
 from tests.support.appliance import Appliance, Plants, troubles, wait_until
@@ -185,6 +185,29 @@ def test_impossible_plant_is_refused_and_the_old_keeps_running(plant: Appliance)
     received = before["received"]
     wait_until(lambda: plant.rx("right", "state")["received"] > received + 5)
     assert troubles(plant.rx("right", "state")) == troubles(before)
+
+
+def test_settings_of_a_port_change_one_by_one_while_it_exchanges_data(plant: Appliance) -> None:
+    spec = spec_of(plant, "left")
+    eap0, bus0 = spec.ports
+    engine = plant.pid("engine")
+    for change in (
+        {"join": ("239.1.2.3",)},
+        {"broadcast": True},
+        {"tcp": True},
+        {"wake": Wake.ARRIVAL},
+        {"eap_sm": True},
+        {"length": LengthCheck.LENIENT},
+        {"profile": 1},
+        {"ams": False},
+        {},
+    ):
+        answer = apply(plant, replace(spec, ports=(replace(eap0, **change), bus0)))
+        assert answer["ok"], (change, answer)
+        received = plant.rx("left", "answer")["received"]
+        wait_until(lambda so_far=received: plant.rx("left", "answer")["received"] > so_far + 2)
+    assert plant.pid("engine") == engine
+    assert spec_of(plant, "left") == spec
 
 
 def test_states_are_requested_of_a_running_bus(plant: Appliance) -> None:
