@@ -38,10 +38,17 @@ class TransportKind(StrEnum):
     """Programs of this appliance."""
     WEB = "web"
     """Browsers: they set variables, and send no packets."""
+    OPCUA = "opcua"
+    """OPC UA clients; these and the next two set variables likewise."""
+    S7 = "s7"
+    MODBUS = "modbus"
 
 
 IP_TRANSPORTS = frozenset(
-    (TransportKind.AMS_TCP, TransportKind.UDP, TransportKind.TCP, TransportKind.WEB)
+    (
+        *(TransportKind.AMS_TCP, TransportKind.UDP, TransportKind.TCP),
+        *(TransportKind.WEB, TransportKind.OPCUA, TransportKind.S7, TransportKind.MODBUS),
+    )
 )
 """Kinds of transports whose connections begin with an IPv4 address."""
 
@@ -163,7 +170,7 @@ class AccessRule(SpecStruct, frozen=True):
         macs: MAC addresses that frames come from on Ethernet; an address in one of the two fits.
         net_ids: Source NetIDs, by their first four, five or all six bytes; they prove nothing.
         transports: Names (``mqtt:line``) or kinds (``ams-tcp``, ``udp``, ``tcp``, ``ethernet``,
-            ``mqtt``, ``local``, ``web``).
+            ``mqtt``, ``local``, ``web``, ``opcua``, ``s7``, ``modbus``).
         targets: Of the requests.
         services: Kinds of operations.
         objects: Of a dictionary; a rule that has some is about nothing else.

@@ -67,6 +67,7 @@ from eap.config.structs import (
     FrameSection,
     FromSection,
     PortSection,
+    Section,
     StationSection,
     SubscribeSection,
     VariableSection,
@@ -489,6 +490,8 @@ class Plant(msgspec.Struct, frozen=True):
     """Page for browsers, with resolved paths; None without one."""
     metrics: MetricsSection | None = None
     """Metrics without a page, with resolved paths; None without them."""
+    bridges: Mapping[str, Section] = {}
+    """Sections of the bridges, by their keys, with resolved paths."""
 
     def on_host(self, host: HostSection) -> Plant:
         """Return the part of the plant that *host* runs: its stations, and the servers it has."""

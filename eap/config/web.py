@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from functools import cache
 from ipaddress import ip_address, ip_network
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -12,12 +11,12 @@ from typing import NamedTuple, TypeVar
 from msgspec.structs import replace
 
 from eap.codec import datatypes
-from eap.codec.structures import variable_of
 from eap.config.brokers import check_file
-from eap.config.finding import FindingReport, PlantFinding, one_beside, one_of
+from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
 from eap.config.passwords import FORM, PasswordHash
 from eap.config.pictures import read_picture
+from eap.config.selection import VariableNames, match_names, reason_not_settable
 from eap.config.structs import StationSection
 from eap.config.web_sections import (
     BindSection,
@@ -39,7 +38,6 @@ from eap.config.web_sections import (
     WebSection,
 )
 from eap.ids import parse_host
-from eap.pd.rules import MADE_SUFFIXES
 from eap.pd.spec import PortKind
 from eap.suggest import suggest
 
@@ -54,7 +52,6 @@ STATE = "state"
 
 ServerT = TypeVar("ServerT", WebSection, MetricsSection)
 
-_OF = "STATION/VARIABLE, with * for any text"
 _LISTEN = "ADDRESS:PORT, such as 127.0.0.1:8080 or [::1]:8080"
 _WINDOW = re.compile(r"(\d{1,6})(s|m|h)")
 _UNITS = {"s": 1, "m": 60, "h": 3600}
@@ -109,19 +106,6 @@ def window_s(text: str) -> int:
 def names_in(of: str | tuple[str, ...]) -> tuple[str, ...]:
     """Return the names and patterns of a panel's ``of``."""
     return (of,) if isinstance(of, str) else of
-
-
-@cache
-def _compiled(pattern: str) -> re.Pattern[str]:
-    return re.compile("[^/]*".join(map(re.escape, pattern.split("*"))))
-
-
-def match_names(pattern: str, names: Iterable[str]) -> list[str]:
-    """Return the *names* that fit *pattern*; ``*`` stands for any text without slashes."""
-    if "*" not in pattern:
-        return [name for name in names if name == pattern]
-    expression = _compiled(pattern)
-    return [name for name in names if expression.fullmatch(name)]
 
 
 def trend_windows(pages: Iterable[WebPage]) -> dict[str, int]:
@@ -310,10 +294,7 @@ class _PanelCheck:
         self._index = index
         self._report = report
         self._folder = folder
-        self._known = {
-            station.name: list(_names_of(index, station)) for station in index.plant.stations
-        }
-        self._names = [f"{name}/{each}" for name, own in self._known.items() for each in own]
+        self._variables = VariableNames(index, report)
 
     def check(self, web: WebSection) -> None:
         """Report every invalid panel."""
@@ -322,7 +303,8 @@ class _PanelCheck:
             for panel in page.panels:
                 self._check_panel(panel)
                 if isinstance(panel, TrendPanel):
-                    trends.update(*(match_names(of, self._names) for of in names_in(panel.of)))
+                    names = self._variables.names
+                    trends.update(*(match_names(of, names) for of in names_in(panel.of)))
         if len(trends) > MAX_TRENDS:
             message = f"the trends show {len(trends)} variables"
             self._report.add(f"{web.at}.pages", message, f"at most {MAX_TRENDS}")
@@ -332,7 +314,7 @@ class _PanelCheck:
             case ValuePanel() | TablePanel():
                 self._check_variables(panel)
             case StatesPanel():
-                self._check_variables(panel, [f"{name}/{STATE}" for name in self._known])
+                self._check_variables(panel, [f"{name}/{STATE}" for name in self._variables.known])
             case TrendPanel():
                 self._check_variables(panel)
                 self._check_range(panel)
@@ -344,7 +326,7 @@ class _PanelCheck:
             case BusPanel():
                 self._check_patterns(panel, "bus", self._buses(), "STATION/PORT")
             case EventsPanel() | GraphPanel() | RoutesPanel():
-                self._check_patterns(panel, "station", self._known, "a station")
+                self._check_patterns(panel, "station", self._variables.known, "a station")
 
     def _check_variables(
         self,
@@ -352,47 +334,7 @@ class _PanelCheck:
         more: Sequence[str] = (),
     ) -> None:
         for path, name in _paths_of(panel.of, f"{panel.at}.of"):
-            if "*" not in name and name not in more:
-                self._find(path, name)
-            elif not match_names(name, [*self._names, *more]) and not self._may_be_on_bus(name):
-                self._report.add(path, f"no variable fits {name!r}", _OF)
-
-    def _find(self, path: str, name: str) -> tuple[StationSection, str] | None:
-        """Return station and variable that *name* is, after reporting that there is none."""
-        station_name, separator, variable = name.partition("/")
-        station = self._index.stations.get(station_name)
-        if not separator:
-            self._report.add(path, f"{name!r} names no variable", "STATION/VARIABLE")
-        elif station is None:
-            if station_name not in self._report.broken:
-                message = f"unknown station {station_name!r}{suggest(station_name, self._known)}"
-                self._report.add(path, message, one_of(self._known))
-        elif not self._has(station, variable):
-            known = self._known[station_name]
-            message = f"station {station_name} has no variable {variable!r}"
-            message += suggest(variable, known)
-            self._report.add(path, message, one_beside(variable, known))
-        else:
-            return station, variable
-        return None
-
-    def _has(self, station: StationSection, variable: str) -> bool:
-        if variable in self._known[station.name] or self._may_be_on_bus(
-            f"{station.name}/{variable}"
-        ):
-            return True
-        try:
-            return self._index.part(station, variable) is not None
-        except ValueError:
-            return variable.partition(".")[0].partition("[")[0] in self._report.broken
-
-    def _may_be_on_bus(self, name: str) -> bool:
-        """Return whether *name* is of a bus whose file could not be read."""
-        station_name, _, variable = name.partition("/")
-        station = self._index.stations.get(station_name)
-        if station is None:
-            return False
-        return any(variable.startswith(f"{p}.") for p in self._index.unread_buses(station))
+            self._variables.check_pattern(path, name, more)
 
     def _check_patterns(
         self,
@@ -436,10 +378,10 @@ class _PanelCheck:
         if panel.step is not None and panel.step <= 0:
             self._report.add(f"{panel.at}.step", f"step is {panel.step:g}", "more than 0")
         path = f"{panel.at}.of"
-        if (found := self._find(path, panel.of)) is None:
+        if (found := self._variables.find(path, panel.of)) is None:
             return
         station, variable = found
-        if reason := _reason_not_settable(self._index, station, variable):
+        if reason := reason_not_settable(self._index, station, variable):
             message = f"variable {panel.of} cannot be set: {reason}"
             self._report.add(path, message, "a variable without source and link")
         has_limits = panel.low is not None or panel.high is not None
@@ -457,7 +399,7 @@ class _PanelCheck:
             ids = None
         for selector, bound in panel.bind.items():
             path = f"{panel.at}.bind.{selector}"
-            self._find(path, bound.of)
+            self._variables.find(path, bound.of)
             self._check_range(bound)
             if not selector.startswith("#"):
                 self._report.add(path, f"{selector!r} is no element", "# and the id of an element")
@@ -466,33 +408,11 @@ class _PanelCheck:
                 self._report.add(path, message, one_of(sorted(ids)[:12]))
 
 
-def _names_of(index: Index, station: StationSection) -> Iterator[str]:
-    """Yield all variables of a station, also those that control its frames and PDs."""
-    yield from index.names(station)
-    for frame in station.frames:
-        yield f"{frame.name}{MADE_SUFFIXES[1]}"
-    for pd in station.publish:
-        yield f"{pd.name}{MADE_SUFFIXES[0]}"
-
-
 def _paths_of(of: str | tuple[str, ...], at: str) -> Iterator[tuple[str, str]]:
     if isinstance(of, str):
         yield at, of
     else:
         yield from ((f"{at}[{position}]", name) for position, name in enumerate(of))
-
-
-def _reason_not_settable(index: Index, station: StationSection, name: str) -> str:
-    names = index.names(station)
-    variable = variable_of(name, names)
-    if any(variable_of(each, names) == variable for each in station.sources):
-        return "it has a source"
-    if any(variable_of(each.target, names) == variable for each in station.links):
-        return "a link writes it"
-    if (on_bus := index.bus_variables(station).get(variable)) is not None:
-        return "" if on_bus.is_output else "it is an input of a bus"
-    is_received = variable in names and variable not in station.variables
-    return "it is received" if is_received else ""
 
 
 def _is_number(index: Index, station: StationSection, name: str) -> bool:

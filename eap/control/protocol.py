@@ -116,13 +116,15 @@ class WriteOrigin(Parameters, frozen=True):
 
     Attributes:
         user: Name of the user, empty for one without login.
-        host: Address of the user's browser.
+        host: Address of the user's program; of MQTT the topic.
         comment: The user's reason.
+        transport: Transport of the program, as access rules name it.
     """
 
     user: str
     host: str
     comment: str = ""
+    transport: Literal["web", "mqtt", "opcua", "s7", "modbus"] = "web"
 
 
 class WriteParameters(Parameters, frozen=True):
@@ -188,12 +190,16 @@ class Values(Document, frozen=True):
     """Answer to ``read``: values of one moment.
 
     *quality* is that of received variables, in units of 100 us; None before the first time.
+    *stale* has those of them whose PD does not arrive any more.  *time_ns* is the Unix time of the
+    cycle; 0 from an appliance of an older release.
     """
 
     station: str
     cycle: int
     values: dict[str, Any]
     quality: dict[str, int | None]
+    time_ns: int = 0
+    stale: tuple[str, ...] = ()
 
 
 class ValuesEvent(Values, frozen=True):

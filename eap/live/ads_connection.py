@@ -16,6 +16,8 @@ from itertools import count
 from secrets import randbelow
 from typing import Any, NamedTuple, Self
 
+from msgspec.structs import asdict
+
 from eap.ads.request import Operation, ReadWrite, Write, decode_outcome, encode_query
 from eap.ads.symboltypes import symbol_type
 from eap.codec import datatypes
@@ -179,8 +181,12 @@ class AdsConnection:
                 skipped = 0 if last_cycle is None else max(found.cycle - last_cycle - 1, 0)
                 last_cycle = found.cycle
                 if values:
-                    quality = {n: q for n, q in found.quality.items() if n in values}
-                    yield ValuesEvent(found.station, found.cycle, values, quality, skipped)
+                    changed = {
+                        "values": values,
+                        "quality": {n: q for n, q in found.quality.items() if n in values},
+                        "stale": tuple(n for n in found.stale if n in values),
+                    }
+                    yield ValuesEvent(**asdict(found) | changed, skipped=skipped)
             due_s = max(due_s + wanted.period_ms / 1000, clock())
             await asyncio.sleep(due_s - clock())
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 import msgspec
+from msgspec.structs import replace
 
 from eap.control.protocol import (
     MAX_LINE,
@@ -206,10 +207,10 @@ class _LatestValues:
 def _merged(before: ValuesEvent | ControlError | None, event: ValuesEvent) -> ValuesEvent:
     if not isinstance(before, ValuesEvent):
         return event
-    return ValuesEvent(
-        event.station,
-        event.cycle,
-        before.values | event.values,
-        before.quality | event.quality,
-        before.skipped + event.skipped,
+    return replace(
+        event,
+        values=before.values | event.values,
+        quality=before.quality | event.quality,
+        stale=(*(name for name in before.stale if name not in event.values), *event.stale),
+        skipped=before.skipped + event.skipped,
     )

@@ -172,6 +172,20 @@ class WebHandover(InheritedRecord, frozen=True):
     """Only if there is no *web*."""
 
 
+class BridgeHandover(InheritedRecord, frozen=True):
+    """All that the process of a bridge gets."""
+
+    supervisor: int
+    """Process id, as in Handover."""
+    folder: str
+    """The appliance's runtime folder."""
+    plant: str
+    name: str
+    """Key of the plant file."""
+    section: msgspec.Raw
+    """Its section with resolved paths, as JSON: only the bridge knows the type."""
+
+
 class EngineOptions(SpecRecord, frozen=True):
     """Scheduling of the engine."""
 

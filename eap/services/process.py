@@ -31,6 +31,7 @@ from eap.pd.handover import PortChanges
 from eap.pd.spec import PortKind, StationSpec
 from eap.pd.words import StationWord
 from eap.release import RELEASE
+from eap.runtime.bridges import bridge_findings, read_bridges
 from eap.runtime.drop_counters import DropCounters
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import (
@@ -389,13 +390,16 @@ class Services:
 
         async def status() -> dict[str, Any]:
             reports = await bus_reports(buses.clients, STATUS_TIMEOUT_S)
+            info = self._folder.read_info()
+            bridges = read_bridges(self._folder.path, info)
             return appliance_status(
-                self._folder.read_info(),
+                info,
                 [await take_snapshot(each.image) for each in images.values()],
                 (engine.stats(), self._counters.stats()),
                 meter,
                 reports,
                 self._listeners.stats(),
+                bridges,
             ) | {
                 "audit": audit.report(),
                 "findings": [
@@ -403,6 +407,7 @@ class Services:
                     *interruption_findings(devices.routers.values(), time()),
                     *(row for each in devices.by_station.values() for row in each.findings()),
                     *recording_findings(self._handover.plant, time()),
+                    *bridge_findings(self._handover.plant, bridges),
                 ],
             }
 

@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic_ns
+from typing import NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -22,7 +23,7 @@ from msgspec.structs import replace
 from eap.ams.spec import RoutingSpec
 from eap.config.load import Plant
 from eap.errors import ConfigError, EnvironmentalError
-from eap.ids import InterfaceUri
+from eap.ids import InterfaceUri, encode_value
 from eap.net.loopback import LoopbackLines
 from eap.net.realtime import raise_descriptor_limit
 from eap.pd.device import DeviceState
@@ -35,6 +36,7 @@ from eap.runtime.busfile import load_or_raise
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.runtime.handover import (
     NO_DESCRIPTOR,
+    BridgeHandover,
     BusSocket,
     EngineOptions,
     Handover,
@@ -58,8 +60,27 @@ GRACE_NS = 1_000_000_000
 """Time for a process to end after SIGTERM; the whole appliance has two seconds."""
 _EXTRA_PAUSE_NS = 500_000_000
 """Shortest pause before an optional process is started again."""
-_EXTRAS = {"web": ("aiohttp", "web"), "metrics": ("aiohttp", "web")}
-"""Of each optional process: the module that it needs, and the extra that installs it."""
+
+
+class _Extra(NamedTuple):
+    """Optional process.
+
+    Attributes:
+        module: Has its ``main``.
+        needs: Module that must be installed.
+        extra: Extra that installs it.
+    """
+
+    module: str
+    needs: str
+    extra: str
+
+
+_EXTRAS = {
+    "web": _Extra("eap.web.process", "aiohttp", "web"),
+    "metrics": _Extra("eap.web.process", "aiohttp", "web"),
+}
+"""Optional processes by their keys in the plant file."""
 SEGMENT_GRACE_NS = 500_000_000
 """The same for simulated segments, which end after the others."""
 
@@ -204,7 +225,7 @@ class Supervisor:
             directory=plant.directory,
             audit_required=plant.audit_required,
         )
-        self._extras |= _optional_processes(plant, self._bytecode)
+        self._extras |= _optional_processes(plant, folder, self._bytecode)
         self._sockets = sockets
         self._common = common
         self._given = {
@@ -397,7 +418,7 @@ class Supervisor:
         if child in self._extras:
             # A reason that the process knows is its last step: a line for each try would fill the
             # log.
-            known = last_step if code == 2 else last_line
+            known = last_step if code == 2 and last_step else last_line
             self._restart_extra(child, describe_end(code) if code <= 0 else known, lived_ns)
             return
         never_ran = not child.watch.has_run and not child.watch.is_stuck
@@ -429,10 +450,10 @@ class Supervisor:
 
     def _start_extra(self, child: Child) -> None:
         self._restart_ns.pop(child, None)
-        module, extra = _EXTRAS[child.name]
-        if find_spec(module) is None:
+        _, needs, extra = _EXTRAS[child.name]
+        if find_spec(needs) is None:
             # Only another installation changes this: without a restart it is not tried again.
-            child.fault = f"{module} is not installed: pip install 'eap-appliance[{extra}]'"
+            child.fault = f"{needs} is not installed: pip install 'eap-appliance[{extra}]'"
             logger.warning("%s does not run: %s", child.name, child.fault)
             self._write_info()
             return
@@ -553,16 +574,20 @@ def _process_info(child: Child) -> ProcessInfo:
     return ProcessInfo(child.pid, child.restarts, child.report, child.watch.step, child.fault)
 
 
-def _optional_processes(plant: Plant, bytecode: str) -> dict[Child, InheritedRecord]:
+def _optional_processes(
+    plant: Plant, folder: ApplianceFolder, bytecode: str
+) -> dict[Child, InheritedRecord]:
     """Return the processes that the plant file asks for and the plant does not need."""
-    found: dict[Child, InheritedRecord] = {}
+    own = os.getpid()
+    handovers: dict[str, InheritedRecord] = {}
     if plant.web is not None:
-        handover = WebHandover(os.getpid(), plant.name, web=plant.web)
-        found[Child("web", "eap.web.process", bytecode)] = handover
+        handovers["web"] = WebHandover(own, plant.name, web=plant.web)
     if plant.metrics is not None:
-        handover = WebHandover(os.getpid(), plant.name, metrics=plant.metrics)
-        found[Child("metrics", "eap.web.process", bytecode)] = handover
-    return found
+        handovers["metrics"] = WebHandover(own, plant.name, metrics=plant.metrics)
+    for name, section in plant.bridges.items():
+        raw = msgspec.Raw(msgspec.json.encode(section, enc_hook=encode_value))
+        handovers[name] = BridgeHandover(own, str(folder.path), plant.name, name, raw)
+    return {Child(name, _EXTRAS[name].module, bytecode): each for name, each in handovers.items()}
 
 
 def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:

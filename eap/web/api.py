@@ -13,7 +13,8 @@ from aiohttp import web
 
 from devicebus.errors import BusError
 from eap.config.pictures import read_picture
-from eap.config.web import default_pages, match_names, window_s
+from eap.config.selection import match_names
+from eap.config.web import default_pages, window_s
 from eap.config.web_sections import PicturePanel, WebPage, WebSection
 from eap.control.protocol import ErrorCode, WriteOrigin
 from eap.errors import ControlError

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from eap.codec.structures import variable_of
-from eap.config.web import STATE, match_names
+from eap.config.selection import match_names
+from eap.config.web import STATE
 from eap.control.protocol import (
     PD_LIST,
     READ,

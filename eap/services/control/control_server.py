@@ -105,6 +105,8 @@ def change_of(
     author = {}
     if isinstance(origin, dict):
         author = {key: _shortened(origin.get(key, "")) for key in ("user", "host", "comment")}
+        client = "@".join(str(author[key]) for key in ("user", "host") if author[key])
+        author["by"] = f"{_shortened(origin.get('transport', 'web'))}:{client}"
     station = str(
         described.pop("station", "") or str(described.get("target", "")).partition("/")[0]
     )

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from inspect import isawaitable
+from time import monotonic_ns, time_ns
 from typing import Any
+
+from msgspec.structs import asdict
 
 from eap.codec import datatypes
 from eap.codec.structures import variable_of
@@ -23,7 +26,7 @@ from eap.pd.layout import VariableSlot
 from eap.pd.quality import quality, tracker_word
 from eap.pd.report import PdRow, pd_list
 from eap.pd.spec import Writer
-from eap.pd.words import RxWord, StationWord
+from eap.pd.words import RxState, RxWord, StationWord
 from eap.suggest import suggest
 
 MIN_PERIOD_MS = 10
@@ -39,8 +42,8 @@ class Methods:
         images: The process image of each station.
         status: Makes the answer to ``status``.
         stop: Asks the appliance to end.
-        deny_write: Returns the reason that a user of the page may not write variables of a
-            station, empty if it may.
+        deny_write: Returns the reason that a user of the page or a bridge may not write variables
+            of a station, empty if it may.
         more: Other methods by name.
     """
 
@@ -178,15 +181,19 @@ class Watch:
         if self._last_cycle is not None:
             self._skipped += max(now.cycle - self._last_cycle - 1, 0)
         self._last_cycle = now.cycle
-        values, quality = now.values, now.quality
+        fields = asdict(now)
         if self._only_changes:
-            last, self._last = self._last, values
-            values = {n: v for n, v in values.items() if n not in last or last[n] != v}
+            last, self._last = self._last, now.values
+            values = {n: v for n, v in now.values.items() if n not in last or last[n] != v}
             if not values:
                 return None
-            quality = {n: q for n, q in quality.items() if n in values}
+            fields |= {
+                "values": values,
+                "quality": {n: q for n, q in now.quality.items() if n in values},
+                "stale": tuple(n for n in now.stale if n in values),
+            }
         skipped, self._skipped = self._skipped, 0
-        return control.ValuesEvent(now.station, now.cycle, values, quality, skipped)
+        return control.ValuesEvent(**fields, skipped=skipped)
 
 
 def _snapshot(image: Image, slots: list[VariableSlot]) -> control.Values:
@@ -205,21 +212,35 @@ def _snapshot(image: Image, slots: list[VariableSlot]) -> control.Values:
         values = engine.read_slots(slots, (Writer.ENGINE,)) | image.read_slots(slots, _OTHERS)
     plain = {p.name: datatypes.parse(p.type).to_plain(values[p.name]) for p in slots}
     cycle = engine.words[StationWord.CYCLE]
-    return control.Values(image.layout.station, cycle, plain, _qualities(engine, plain))
+    quality, stale = _qualities(engine, plain)
+    age_ns = monotonic_ns() - engine.words[StationWord.CYCLE_AT_NS]
+    return control.Values(
+        image.layout.station, cycle, plain, quality, time_ns=time_ns() - age_ns, stale=stale
+    )
 
 
-def _qualities(image: Image, names: Mapping[str, Any]) -> dict[str, int | None]:
-    """Return the quality of those of *names* that are received, None before the first time."""
+def _qualities(
+    image: Image, names: Mapping[str, Any]
+) -> tuple[dict[str, int | None], tuple[str, ...]]:
+    """Return the quality of those of *names* that are received, and those that are stale.
+
+    The quality is None before the first time.
+    """
     parts: dict[str, list[str]] = {}
     for name in names:
         parts.setdefault(variable_of(name, image.slots), []).append(name)
     qualities: dict[str, int | None] = {}
+    stale: list[str] = []
     for rx in image.layout.rx:
-        received = image.words[tracker_word(image, rx) + RxWord.RECEIVED]
-        value = quality(image, rx) if received else None
+        first = tracker_word(image, rx)
+        value = quality(image, rx) if image.words[first + RxWord.RECEIVED] else None
+        is_stale = image.words[first + RxWord.STATE] == RxState.STALE
         for variable in rx.variables:
-            qualities.update((name, value) for name in parts.get(variable, ()))
-    return qualities
+            received = parts.get(variable, ())
+            qualities.update((name, value) for name in received)
+            if is_stale:
+                stale += received
+    return qualities, tuple(stale)
 
 
 def _slots_of(image: Image, names: Iterable[str]) -> list[VariableSlot]:

@@ -11,6 +11,8 @@ from pathlib import Path
 from time import CLOCK_BOOTTIME, clock_gettime_ns, monotonic_ns, time_ns
 from typing import Any
 
+from msgspec.structs import asdict
+
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
 from eap.net.interface import interface_of, is_there, link_is_up
@@ -19,6 +21,7 @@ from eap.pd.image import Image
 from eap.pd.report import station_status
 from eap.pd.spec import PortKind
 from eap.pd.words import StationWord
+from eap.runtime.bridges import BridgeStatus
 from eap.runtime.bus_status import bus_document, bus_link
 from eap.runtime.engine_messages import BusReport
 from eap.runtime.folder import ApplianceInfo, ProcessInfo
@@ -128,6 +131,7 @@ def appliance_status(
     meter: ProcessMeter,
     buses: Mapping[PortName, BusReport],
     listeners: Iterable[ListenerStats] = (),
+    bridges: Mapping[str, BridgeStatus] = {},
 ) -> dict[str, Any]:
     """Return the whole answer.
 
@@ -138,6 +142,7 @@ def appliance_status(
         meter: Of the processes.
         buses: Report of the engine on its buses; empty if it does not answer.
         listeners: Figures of the listeners of services.
+        bridges: Status of those bridges that have one, by the names of their processes.
     """
     now_ns = clock_gettime_ns(CLOCK_BOOTTIME)
     engine = _process(info.engine, meter, now_ns)
@@ -153,6 +158,8 @@ def appliance_status(
         processes[name] = _process(process, meter, now_ns) | process.report
         if process.fault:
             processes[name]["fault"] = process.fault
+        if (bridge := bridges.get(name)) is not None:
+            processes[name]["bridge"] = {k: v for k, v in asdict(bridge).items() if k != "pid"}
     if info.segments:
         processes["segments"] = {
             name: _process(process, meter, now_ns) for name, process in info.segments.items()

@@ -101,17 +101,24 @@ def access_of(station: StationSpec, routing: RoutingSpec) -> AccessList:
     return AccessList((*closed, *routing.access), own=tuple(_own_addresses(station)))
 
 
-def denial_of_write(router: StationRouter, origin: WriteOrigin) -> str:
-    """Return the rule that denies a user of the page to write variables, empty if none does.
+_WITH_ROLES = frozenset((TransportKind.WEB, TransportKind.OPCUA))
 
-    The page has checked the user's role.  So without a rule it may write, also from another host,
-    whose programs may not: they have no user.
+
+def denial_of_write(router: StationRouter, origin: WriteOrigin) -> str:
+    """Return the reason that a user of the page or a bridge may not write variables.
+
+    Page and OPC UA server have checked the user's role.  So without a rule it may write, also from
+    another host, whose programs may not: they have no user.
+
+    Returns:
+        The rule, or the default, in words; empty if it may.
     """
-    # A browser has no NetID, and its address no port that would tell anything.
-    endpoint = Endpoint(TransportKind.WEB, origin.host)
+    # These clients have no NetID, and their addresses no port that would tell anything.
+    endpoint = Endpoint(TransportKind(origin.transport), origin.host)
     grants = router.access.grants(endpoint, NetId(b""), router.net_id, IO_PORT)
     decision = grants.decide(Write(IndexGroup.VALUE_BY_HANDLE, 0, b""))
-    return decision.why if decision.is_by_rule and not decision.is_allowed else ""
+    is_by_role = endpoint.kind in _WITH_ROLES and not decision.is_by_rule
+    return "" if decision.is_allowed or is_by_role else decision.why
 
 
 def mqtt_transport_name(spec: MqttSpec) -> str:

@@ -7,7 +7,8 @@ import pytest
 
 from eap.config.index import ExpectedBus
 from eap.config.load import PlantResult, load
-from eap.config.web import default_role, match_names, parse_listen, window_s
+from eap.config.selection import match_names
+from eap.config.web import default_role, parse_listen, window_s
 from eap.config.web_sections import Role, WebSection
 from tests.support.webplant import HASH
 

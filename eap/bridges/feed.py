@@ -1,0 +1,261 @@
+"""Variables of an appliance that patterns select, with their present values.
+
+Nothing here raises for an appliance that does not answer: its values become stale.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import aclosing, suppress
+from enum import StrEnum
+from time import time_ns
+from typing import Any, NamedTuple
+
+from eap.codec import datatypes
+from eap.codec.structures import find_variable
+from eap.config.selection import match_names
+from eap.control.protocol import (
+    HELLO,
+    MAX_SUBSCRIPTIONS,
+    VARIABLES,
+    ErrorCode,
+    ValuesEvent,
+    VariableRow,
+)
+from eap.errors import ControlError
+from eap.live.client import LiveClient
+from eap.live.transport import ValuesSubscription
+from eap.pd.quality import QUALITY_NS
+from eap.pd.spec import Writer
+
+DIRECTORY_S = 10.0
+"""Period in which variables that appear or go are noticed."""
+RETRY_S = 0.5
+OLD_NS = 2_000_000_000
+"""Beyond the period, values of a station that runs no cycle are stale."""
+
+logger = logging.getLogger(__name__)
+
+
+class Quality(StrEnum):
+    """Quality of a value."""
+
+    GOOD = "good"
+    STALE = "stale"
+    """The last value: its PD, its station or the appliance does not send any more."""
+    BAD = "bad"
+    """It was never received."""
+
+
+class BridgeVariable(NamedTuple):
+    """Variable that a bridge serves, or a member or element of one.
+
+    Attributes:
+        station: Its station.
+        variable: Its name there, such as ``axis.position``.
+        type: Text of its type, for :func:`eap.codec.datatypes.parse`.
+        unit: Its unit, empty without one.
+        comment: Its comment.
+        is_settable: True if the application writes it, so that :meth:`Bridge.write` may.
+    """
+
+    station: str
+    variable: str
+    type: str
+    unit: str
+    comment: str
+    is_settable: bool
+
+    @property
+    def name(self) -> str:
+        """``STATION/NAME``."""
+        return f"{self.station}/{self.variable}"
+
+
+class Sample(NamedTuple):
+    """Value of a variable.
+
+    Attributes:
+        value: As in the control protocol: bool, int, float, str, list, or dict of a struct.
+        quality: Its quality.
+        time_ns: Unix time at which its data was made: of the cycle, less the age of received data.
+    """
+
+    value: Any
+    quality: Quality
+    time_ns: int
+
+
+def select(
+    rows: Iterable[VariableRow], station: str, patterns: Iterable[str]
+) -> list[BridgeVariable]:
+    """Return the variables of a station that fit *patterns*, in the order of the station.
+
+    Args:
+        rows: All variables of the station.
+        station: Its name.
+        patterns: ``STATION/NAME``, with ``*`` for any text; without, it may name a member.
+    """
+    by_name = {row.name: row for row in rows}
+    names = [f"{station}/{name}" for name in by_name]
+    found: dict[str, BridgeVariable] = {}
+    for pattern in patterns:
+        chosen = match_names(pattern, names) if "*" in pattern else [pattern]
+        for name in chosen:
+            variable = name.removeprefix(f"{station}/")
+            if variable != name and (made := _variable(by_name, station, variable)) is not None:
+                found[variable] = made
+    order = {name: position for position, name in enumerate(by_name)}
+    return sorted(found.values(), key=lambda each: order.get(each.variable, len(order)))
+
+
+def _variable(
+    rows: Mapping[str, VariableRow], station: str, variable: str
+) -> BridgeVariable | None:
+    def type_of(name: str) -> datatypes.DataType | None:
+        row = rows.get(name)
+        return None if row is None else datatypes.parse(row.type)
+
+    try:
+        found = find_variable(variable, type_of)
+    except ValueError:
+        return None
+    if found is None:
+        return None
+    row, part = rows[found[0]], found[1]
+    is_settable = row.writer == Writer.APPLICATION
+    return BridgeVariable(station, variable, part.kind.text, row.unit, row.comment, is_settable)
+
+
+class BridgeFeed:
+    """Values of the variables of an appliance that *patterns* select.
+
+    Args:
+        connect: Returns a client of the appliance that is not connected yet.
+        patterns: ``STATION/NAME``, with ``*`` for any text without slashes.
+        period_ms: Period of values, at least 10.
+        on_variables: Called when *variables* has changed.
+        on_values: Called with the values that changed, or whose quality did, by ``STATION/NAME``.
+        now: Unix time in nanoseconds.
+
+    Attributes:
+        variables: The variables, by ``STATION/NAME``.
+        samples: The latest value of each; none before the first.
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[], LiveClient],
+        patterns: Iterable[str],
+        period_ms: int,
+        *,
+        on_variables: Callable[[], None] = lambda: None,
+        on_values: Callable[[Mapping[str, Sample]], None] = lambda _: None,
+        now: Callable[[], int] = time_ns,
+    ) -> None:
+        self.variables: dict[str, BridgeVariable] = {}
+        self.samples: dict[str, Sample] = {}
+        self._connect = connect
+        self._patterns = tuple(patterns)
+        self._period_ms = period_ms
+        self._on_variables = on_variables
+        self._on_values = on_values
+        self._now = now
+        self._clients: list[LiveClient] = []
+        self._watches: dict[str, asyncio.Task[None]] = {}
+        self._by_station: dict[str, tuple[BridgeVariable, ...]] = {}
+        self._has_gone = asyncio.Event()
+
+    async def run(self) -> None:
+        """Follow the appliance until cancelled."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                while True:
+                    pause_s = DIRECTORY_S
+                    try:
+                        await self._follow_directory(group)
+                    except ControlError as exc:
+                        logger.debug("variables: %s", exc)
+                        pause_s = RETRY_S
+                    self._has_gone.clear()
+                    with suppress(TimeoutError):
+                        async with asyncio.timeout(pause_s):
+                            await self._has_gone.wait()
+        finally:
+            for client in self._clients:
+                await client.close()
+
+    def _client(self, number: int) -> LiveClient:
+        """Return the client for the station at a position: a connection has few subscriptions."""
+        while len(self._clients) <= number // MAX_SUBSCRIPTIONS:
+            self._clients.append(self._connect())
+        return self._clients[number // MAX_SUBSCRIPTIONS]
+
+    async def _follow_directory(self, group: asyncio.TaskGroup) -> None:
+        """Read which variables there are, and subscribe to those that are new."""
+        stations = (await self._client(0).call(HELLO)).stations
+        found = {}
+        for station in stations:
+            rows = await self._client(0).call(VARIABLES, station=station)
+            found[station] = tuple(select(rows, station, self._patterns))
+        changed = [name for name in found if found[name] != self._by_station.get(name)]
+        if changed or found.keys() != self._by_station.keys():
+            self._by_station = found
+            self.variables = {each.name: each for own in found.values() for each in own}
+            self.samples = {n: each for n, each in self.samples.items() if n in self.variables}
+            self._on_variables()
+        for number, station in enumerate(stations):
+            running = self._watches.get(station)
+            if running is not None and (station in changed or running.done()):
+                running.cancel()
+                running = None
+            if running is None and found[station]:
+                watch = self._watch(self._client(number), station, found[station])
+                self._watches[station] = group.create_task(watch)
+
+    async def _watch(
+        self, client: LiveClient, station: str, variables: tuple[BridgeVariable, ...]
+    ) -> None:
+        names = tuple(each.variable for each in variables)
+        wanted = ValuesSubscription(station=station, names=names, period_ms=self._period_ms)
+        async with aclosing(client.watch(wanted)) as events:
+            async for event in events:
+                if isinstance(event, ValuesEvent):
+                    self._take(event)
+                    continue
+                logger.debug("values of %s: %s", station, event)
+                self._age(variables)
+                if event.code == ErrorCode.UNKNOWN_NAME:  # configured anew
+                    self._has_gone.set()
+                    return
+
+    def _take(self, event: ValuesEvent) -> None:
+        old_ns = OLD_NS + self._period_ms * 1_000_000
+        is_old = 0 < event.time_ns < self._now() - old_ns
+        changed = {}
+        for variable, value in event.values.items():
+            name = f"{event.station}/{variable}"
+            age = event.quality.get(variable, 0)
+            quality = Quality.STALE if is_old or variable in event.stale else Quality.GOOD
+            if age is None:
+                quality, age = Quality.BAD, 0
+            before = self.samples.get(name)
+            sample = Sample(value, quality, event.time_ns - age * QUALITY_NS)
+            self.samples[name] = sample
+            if before is None or before.value != value or before.quality is not quality:
+                changed[name] = sample
+        if changed:
+            self._on_values(changed)
+
+    def _age(self, variables: Iterable[BridgeVariable]) -> None:
+        """Mark the values of a station that does not answer as stale."""
+        changed = {}
+        for each in variables:
+            sample = self.samples.get(each.name)
+            if sample is not None and sample.quality is Quality.GOOD:
+                changed[each.name] = sample._replace(quality=Quality.STALE)
+        if changed:
+            self.samples |= changed
+            self._on_values(changed)
