@@ -70,8 +70,9 @@ def web(plant: Path | None, hosts: tuple[str, ...], listen: str | None, user: st
 def _read(plant: Path | None, listen: str | None) -> tuple[str, WebSection]:
     from msgspec.structs import replace
 
+    from eap.config.users import Role
     from eap.config.web import parse_listen
-    from eap.config.web_sections import Role, WebSection
+    from eap.config.web_sections import WebSection
 
     name, section = "", WebSection()
     if plant is not None:

@@ -14,10 +14,10 @@ from eap.codec import datatypes
 from eap.config.brokers import check_file
 from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
-from eap.config.passwords import FORM, PasswordHash
 from eap.config.pictures import read_picture
 from eap.config.selection import VariableNames, match_names, reason_not_settable
 from eap.config.structs import StationSection
+from eap.config.users import Role, check_users
 from eap.config.web_sections import (
     BindSection,
     BusPanel,
@@ -26,7 +26,6 @@ from eap.config.web_sections import (
     MetricsSection,
     Panel,
     PicturePanel,
-    Role,
     RoutesPanel,
     ServerSection,
     SetPanel,
@@ -218,7 +217,7 @@ def warn_of_pictures(index: Index, report: FindingReport, folder: Path) -> list[
 def _check_server(section: ServerSection, report: FindingReport, folder: Path) -> None:
     """Report every invalid key that all servers have."""
     _check_listen(section, report)
-    _check_users(section, report)
+    check_users(section.users, report, needs_passwords=section.proxy is None)
     _check_proxy(section, report)
     for position, name in enumerate(section.hosts):
         try:
@@ -250,23 +249,6 @@ def _check_listen(web: ServerSection, report: FindingReport) -> None:
     if web.anonymous not in {None, Role.VIEWER}:
         message = f"anonymous: every host would be {web.anonymous} without a password"
         report.add(f"{web.at}.anonymous", message, "viewer, or no such key")
-
-
-def _check_users(web: ServerSection, report: FindingReport) -> None:
-    names: set[str] = set()
-    for user in web.users:
-        if not user.name.strip() or not user.name.isprintable() or ":" in user.name:
-            report.add(f"{user.at}.name", f"user {user.name!r}", "a name without colons")
-        if user.name in names:
-            report.add(f"{user.at}.name", f"user {user.name} is there twice", "each user once")
-        names.add(user.name)
-        if not user.password and web.proxy is not None:
-            continue
-        try:
-            PasswordHash.parse(user.password)
-        except ValueError as exc:
-            where = f"{user.at}.password" if user.password else user.at
-            report.add(where, f"user {user.name}: {exc}", FORM)
 
 
 def _check_proxy(web: ServerSection, report: FindingReport) -> None:

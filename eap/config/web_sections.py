@@ -13,17 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from eap.config.structs import Section
-
-
-class Role(StrEnum):
-    """Rights of a user of the page, each with those of the ones before."""
-
-    VIEWER = "viewer"
-    """Sees everything."""
-    OPERATOR = "operator"
-    """Sets the variables of ``set`` panels for operators."""
-    ENGINEER = "engineer"
-    """Sets every variable of the application."""
+from eap.config.users import AccountSection, Role
 
 
 class CommentRule(StrEnum):
@@ -175,14 +165,6 @@ class WebPage(Section, frozen=True, kw_only=True):
     panels: tuple[Panel, ...]
 
 
-class WebUser(Section, frozen=True, kw_only=True):
-    """User of the page; *password* is a hash."""
-
-    name: str
-    role: Role = Role.VIEWER
-    password: str = ""
-
-
 class WebTls(Section, frozen=True, kw_only=True):
     """Certificate and key of the page's server; files by their paths from the plant file on."""
 
@@ -202,7 +184,7 @@ class ServerSection(Section, frozen=True, kw_only=True):
 
     listen: str
     hosts: tuple[str, ...] = ()
-    users: tuple[WebUser, ...] = ()
+    users: tuple[AccountSection, ...] = ()
     anonymous: Role | None = None
     tls: WebTls | None = None
     proxy: WebProxy | None = None

@@ -25,11 +25,11 @@ from typing import Final, TypeAlias
 
 from aiohttp import web
 
-from eap.config.passwords import MAX_PASSWORD, PasswordHash
 from eap.config.web import default_role
 from eap.config.web_sections import ServerSection
+from eap.live.logins import LoginFailure, Logins, Principal
 from eap.net.limits import RateLimiter
-from eap.web.sessions import SESSION_S, LoginGuard, Principal, Sessions
+from eap.web.sessions import SESSION_S, Sessions
 
 Handler: TypeAlias = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -41,8 +41,6 @@ BODY_S = 10.0
 _RATE = 200, 50.0
 """Requests of a host at once, and each second in the long run."""
 _MAX_HOSTS = 1024
-_MAX_HASHING = 8
-"""Logins that wait for their password to be hashed."""
 _REMEMBERED_S = 300.0
 _MAX_REMEMBERED = 256
 _SAFE = frozenset(("GET", "HEAD"))
@@ -100,13 +98,9 @@ class Guard:
             ip_network(text, strict=False)
             for text in (section.proxy.networks if section.proxy else ())
         ]
-        self._logins = LoginGuard()
+        self._logins = Logins(section.users)
         self._rates: OrderedDict[str, RateLimiter] = OrderedDict()
-        self._hashing = asyncio.Semaphore(1)
-        self._waiting = 0
         self._remembered: OrderedDict[bytes, tuple[str, float]] = OrderedDict()
-        # One that no password has: an unknown user takes as long as a wrong password.
-        self._nobody = PasswordHash(1 << 15, 8, 1, os.urandom(16), bytes(32))
 
     @web.middleware
     async def check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -267,28 +261,18 @@ class Guard:
 
     async def _verify(self, user: str, password: str, host: str) -> web.Response | None:
         """Return None if a password is right, else the refusal."""
-        now_s = monotonic()
-        if locked_s := self._logins.locked_s(user, host, now_s):
-            wait = f"{locked_s:.0f}"
-            message = f"too many wrong passwords: wait {wait} s"
-            return refusal(429, message, **{"Retry-After": wait})
-        if self._waiting >= _MAX_HASHING:
-            return refusal(503, "too many logins at once", **{"Retry-After": "2"})
-        known = self._users.get(user)
-        stored = PasswordHash.parse(known.password) if known and known.password else self._nobody
-        self._waiting += 1
-        try:
-            # One at a time: each takes 32 MB and a tenth of a second of a core.
-            async with self._hashing:
-                is_right = await asyncio.to_thread(stored.matches, password)
-        finally:
-            self._waiting -= 1
-        if is_right and len(password.encode()) <= MAX_PASSWORD:
-            self._logins.succeed(user, host)
+        found = await self._logins.verify(user, password, host)
+        if isinstance(found, Principal):
             return None
-        number = self._logins.fail(user, host, monotonic())
-        logger.warning("login of %r from %s refused (%d wrong passwords)", user[:40], host, number)
-        return refusal(401, "unknown user or wrong password")
+        wait = f"{found.wait_s:.0f}"
+        match found.why:
+            case LoginFailure.LOCKED:
+                message = f"too many wrong passwords: wait {wait} s"
+                return refusal(429, message, **{"Retry-After": wait})
+            case LoginFailure.BUSY:
+                return refusal(503, "too many logins at once", **{"Retry-After": wait})
+            case LoginFailure.WRONG:
+                return refusal(401, "unknown user or wrong password")
 
 
 def needs_user(request: web.Request) -> Principal:

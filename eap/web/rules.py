@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from eap.config.web_sections import CommentRule, Role, SetPanel, WebPage
-from eap.web.sessions import Principal
+from eap.config.users import Role
+from eap.config.web_sections import CommentRule, SetPanel, WebPage
+from eap.live.logins import Principal
 
 
 class SetRules:

@@ -12,7 +12,8 @@ from typing import Any
 from aiohttp.test_utils import TestClient, TestServer
 
 from eap.config.passwords import PasswordHash
-from eap.config.web_sections import Role, WebPage, WebSection, WebUser
+from eap.config.users import AccountSection, Role
+from eap.config.web_sections import WebPage, WebSection
 from eap.control.protocol import ErrorCode, ValuesEvent
 from eap.errors import ControlError
 from eap.live.client import LiveClient
@@ -100,8 +101,8 @@ class StubPlant:
         return {"written": 1}
 
 
-def user(name: str, role: Role, password: str = HASH) -> WebUser:
-    return WebUser(name=name, role=role, password=password)
+def user(name: str, role: Role, password: str = HASH) -> AccountSection:
+    return AccountSection(name=name, role=role, password=password)
 
 
 USERS = (user("vera", Role.VIEWER), user("otto", Role.OPERATOR), user("elsa", Role.ENGINEER))

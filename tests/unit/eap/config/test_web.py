@@ -8,8 +8,9 @@ import pytest
 from eap.config.index import ExpectedBus
 from eap.config.load import PlantResult, load
 from eap.config.selection import match_names
+from eap.config.users import Role
 from eap.config.web import default_role, parse_listen, window_s
-from eap.config.web_sections import Role, WebSection
+from eap.config.web_sections import WebSection
 from tests.support.webplant import HASH
 
 PLANT = """\

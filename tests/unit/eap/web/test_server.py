@@ -12,10 +12,10 @@ import pytest
 from aiohttp import WSMsgType, WSServerHandshakeError, encode_basic_auth
 from msgspec.structs import replace
 
+from eap.config.users import Role
 from eap.config.web_sections import (
     CommentRule,
     PicturePanel,
-    Role,
     SetPanel,
     TablePanel,
     TrendPanel,
@@ -25,10 +25,10 @@ from eap.config.web_sections import (
     WebTls,
 )
 from eap.errors import EnvironmentalError
+from eap.live.logins import FREE_FAILURES
 from eap.live.view import LiveView
 from eap.web import guard, server, sockets
 from eap.web.process import session_key
-from eap.web.sessions import FREE_FAILURES
 from tests.support.webplant import KEY, PASSWORD, USERS, Site, StubPlant, page, site, stub_client
 
 pytestmark = pytest.mark.net
