@@ -309,9 +309,8 @@ _SLAVE = (
 )
 _OWN = (
     Family("eap", "info", "Release of this program.", lambda row: {RELEASE: 1}, "release"),
-    Family(
-        "eap_metrics_left_out", "gauge", "Series beyond the limit of one answer.", _key("left_out")
-    ),
+    _gauge("eap_unreachable", "Appliances and hosts that do not answer.", "unreachable"),
+    _gauge("eap_metrics_left_out", "Series beyond the limit of one answer.", "left_out"),
 )
 FAMILIES: Final = (
     *_APPLIANCE, *_PROCESS, *_LISTENER, *_STATION, *_PORT, *_FRAME, *_SENT_PD, *_RECEIVED_PD,
@@ -333,8 +332,13 @@ class MetricsWriter:
         """Samples without their numbers, by the row they are of."""
         self._heads = {family.name: family.head() for family in FAMILIES}
 
-    def write(self, status: StatusReport) -> str:
-        """Return the metrics of a report, which ends with ``# EOF``."""
+    def write(self, status: StatusReport, unreachable: int = 0) -> str:
+        """Return the metrics of a report, which ends with ``# EOF``.
+
+        Args:
+            status: The appliances that answer.
+            unreachable: Number of those that do not, of which there are no other series.
+        """
         samples: dict[str, list[str]] = {family.name: [] for family in FAMILIES}
         left = MAX_SERIES
         left_out = 0
@@ -349,7 +353,8 @@ class MetricsWriter:
             left -= len(lines)
             for name, line in lines:
                 samples[name].append(line)
-        for name, line in self._samples(_OWN, (), {"left_out": left_out}):
+        own = {"left_out": left_out, "unreachable": unreachable}
+        for name, line in self._samples(_OWN, (), own):
             samples[name].append(line)
         if known > 2 * seen + 16:
             # Stations or PDs have gone: the next report makes those again that are left.

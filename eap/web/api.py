@@ -20,7 +20,7 @@ from eap.control.protocol import ErrorCode, WriteOrigin
 from eap.errors import ControlError
 from eap.ids import encode_value
 from eap.release import RELEASE
-from eap.web.feed import PlantFeed, Shown
+from eap.web.feed import UNKNOWN, PlantFeed, Shown
 from eap.web.guard import TOKEN, USER, Guard, needs_user, read_json, refusal
 from eap.web.openapi import DOCUMENT
 from eap.web.rules import SetRules
@@ -248,14 +248,25 @@ class Api:
         for name in names:
             station, _, variable = name.partition("/")
             by_station.setdefault(station, []).append(variable)
-        found: dict[str, tuple[Shown, int | None]] = {}
         try:
-            for station, variables in by_station.items():
-                found |= await self._feed.read(station, variables)
+            parts = await asyncio.gather(
+                *(self._read_station(*each, "*" in pattern) for each in by_station.items())
+            )
         except (ControlError, BusError) as exc:
             return _failure(exc)
-        values = {name: self._value(name, *each) for name, each in found.items()}
+        values = {name: self._value(name, *each) for part in parts for name, each in part.items()}
         return answer(values if "*" in pattern else values[pattern])
+
+    async def _read_station(
+        self, station: str, variables: list[str], is_pattern: bool
+    ) -> dict[str, tuple[Shown, int | None]]:
+        """Return variables of one station; one that is silent hides no other that fits."""
+        try:
+            return await self._feed.read(station, variables)
+        except (ControlError, BusError):
+            if not is_pattern:
+                raise
+            return {f"{station}/{each}": (UNKNOWN, None) for each in variables}
 
     def _value(self, name: str, shown: Shown, quality: int | None) -> dict[str, Any]:
         return {
@@ -263,7 +274,7 @@ class Api:
             "unit": self._feed.unit_of(name),
             "quality": quality,
             "age_us": shown.age_us,
-            "time": round(time() - (shown.age_us or 0) / 1e6, 3),
+            "time": None if shown.age_us is None else round(time() - shown.age_us / 1e6, 3),
             "stale": shown.is_stale,
         }
 

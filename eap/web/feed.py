@@ -75,7 +75,7 @@ class Shown(NamedTuple):
     is_stale: bool
 
 
-_UNKNOWN = Shown(None, None, True)
+UNKNOWN = Shown(None, None, True)
 
 
 class GraphLink(msgspec.Struct, frozen=True, kw_only=True):
@@ -230,7 +230,7 @@ class PlantFeed:
                 return self._of_sample(station, variable, sample, now_s)
         if variable == STATE and not self._is_readable(station, variable):
             return self._state_of(station)
-        return _UNKNOWN
+        return UNKNOWN
 
     async def read(self, station: str, names: list[str]) -> dict[str, tuple[Shown, int | None]]:
         """Read variables of a station now; raise ControlError if that fails.
@@ -338,7 +338,7 @@ class PlantFeed:
         for row in report.status.stations if report else ():
             if row["name"] == station:
                 return Shown(row["state"], row.get("cycle_age_us"), is_hung(row))
-        return _UNKNOWN
+        return UNKNOWN
 
     def _of_sample(self, station: str, variable: str, sample: _Sample, now_s: float) -> Shown:
         assert sample.event is not None  # noqa: S101  the callers have looked

@@ -40,6 +40,9 @@ BODY_S = 10.0
 """Time for the body of a request."""
 _RATE = 200, 50.0
 """Requests of a host at once, and each second in the long run."""
+_FILE_RATE = 3000, 600.0
+"""The same of files of the page: a browser that opens some tabs asks for hundreds, and a file that
+does not come leaves an empty page."""
 _MAX_HOSTS = 1024
 _REMEMBERED_S = 300.0
 _MAX_REMEMBERED = 256
@@ -99,7 +102,7 @@ class Guard:
             for text in (section.proxy.networks if section.proxy else ())
         ]
         self._logins = Logins(section.users)
-        self._rates: OrderedDict[str, RateLimiter] = OrderedDict()
+        self._rates: OrderedDict[tuple[str, bool], RateLimiter] = OrderedDict()
         self._remembered: OrderedDict[bytes, tuple[str, float]] = OrderedDict()
 
     @web.middleware
@@ -182,7 +185,8 @@ class Guard:
             return refusal(
                 403, f"host {name!r} is unknown here: add it to hosts of the key {self._key}"
             )
-        if not self._take_rate(self.host_of(request)):
+        is_file = not request.path.startswith(("/api/", "/metrics"))
+        if not self._take_rate(self.host_of(request), is_file):
             return refusal(429, "too many requests", **{"Retry-After": "1"})
         return None
 
@@ -197,14 +201,15 @@ class Guard:
             return _NAME.fullmatch(host) is not None and host.rstrip(".") in self._hosts
         return True
 
-    def _take_rate(self, host: str) -> bool:
+    def _take_rate(self, host: str, is_file: bool) -> bool:
         now_s = monotonic()
-        limiter = self._rates.get(host)
+        key = host, is_file
+        limiter = self._rates.get(key)
         if limiter is None:
-            limiter = self._rates[host] = RateLimiter(*_RATE, now_s)
+            limiter = self._rates[key] = RateLimiter(*(_FILE_RATE if is_file else _RATE), now_s)
             if len(self._rates) > _MAX_HOSTS:
                 self._rates.popitem(last=False)
-        self._rates.move_to_end(host)
+        self._rates.move_to_end(key)
         return limiter.take(now_s)
 
     async def _identify(self, request: web.Request) -> web.Response | None:

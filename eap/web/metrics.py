@@ -37,7 +37,7 @@ class MetricsEndpoint:
         report = await self._report()
         if report is None:
             raise web.HTTPServiceUnavailable(reason="the plant has not answered yet")
-        body = self._writer.write(report.status).encode()
+        body = self._writer.write(report.status, len(report.unreachable)).encode()
         return web.Response(body=body, headers={"Content-Type": CONTENT_TYPE})
 
 

@@ -25,7 +25,10 @@ _VALUE = {
             "description": "Age of received data in units of 100 us; null for all other variables.",
         },
         "age_us": {"type": ["integer", "null"], "description": "null before the first data."},
-        "time": {"type": "number", "description": "Unix time of the data."},
+        "time": {
+            "type": ["number", "null"],
+            "description": "Unix time of the data; null before the first.",
+        },
         "stale": {"type": "boolean", "description": "Too old to be relied on."},
     },
 }

@@ -175,6 +175,51 @@ def test_alert_rules_are_valid() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.prometheus
+def test_alerts_fire_for_what_is_wrong_and_for_nothing_else(tmp_path: Path) -> None:
+    series = {
+        "healthy": ["eap_info 1", "eap_unreachable 0", "eap_station_cycles_total 9",
+                    'eap_pd_running{pd="left"} 1', 'eap_pd_age_seconds{pd="left"} 0.02'],
+        "silent": ["eap_info 1", "eap_unreachable 1"],
+        "partly-silent": ["eap_info 1", "eap_unreachable 1", "eap_station_cycles_total 9"],
+        "empty": ["eap_info 1", "eap_unreachable 0"],
+        "waits": ["eap_info 1", "eap_station_cycles_total 9", 'eap_pd_running{pd="left"} 0'],
+        "stale": ["eap_info 1", "eap_station_cycles_total 9", 'eap_pd_running{pd="left"} 0',
+                  'eap_pd_age_seconds{pd="left"} 30'],
+    }  # fmt: skip
+    given = []
+    for instance, lines in series.items():
+        for line in lines:
+            name, _, value = line.rpartition(" ")
+            name, _, labels = name.partition("{")
+            labels = ",".join([f'job="eap",instance="{instance}"', *filter(None, [labels[:-1]])])
+            given.append({"series": f"{name}{{{labels}}}", "values": f"{value}x20"})
+    fired = {
+        "EapPlantSilent": ["silent", "partly-silent", "empty"],
+        "EapPdNotRunning": ["waits", "stale"],
+        "EapStationNotInOp": [],
+        "EapBusDown": [],
+    }
+    expressions = [
+        {
+            "expr": f'count by (instance) (ALERTS{{alertname="{name}",alertstate="firing"}})',
+            "eval_time": "1m",
+            "exp_samples": [
+                {"labels": f'{{instance="{instance}"}}', "value": 1} for instance in instances
+            ],
+        }
+        for name, instances in fired.items()
+    ]
+    rules = str(ROOT / "docs/monitoring/alerts.yml")
+    test = {"interval": "5s", "input_series": given, "promql_expr_test": expressions}
+    path = tmp_path / "test.yml"
+    path.write_text(json.dumps({"rule_files": [rules], "tests": [test]}))
+    done = subprocess.run(
+        ["promtool", "test", "rules", str(path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def panel_queries() -> Iterator[str]:
     """Yield the queries of the dashboard with its variables filled in."""
     dashboard = json.loads((ROOT / "docs/monitoring/grafana-dashboard.json").read_text())

@@ -226,4 +226,4 @@ class App {
 }
 
 const app = new App();
-app.start();
+app.start().catch(() => setTimeout(() => location.reload(), RELOAD_MS)); // its texts did not come

@@ -38,10 +38,10 @@ export class Curves {
   /** Return the arrays that a plot takes: times, then the values of each curve. */
   arrays(until) {
     const oldest = Math.floor((until - this.windowS) / this.widthS);
-    while (this.#buckets.length && this.#buckets[0].index < oldest) this.#buckets.shift();
     const times = [];
     const values = Array.from({ length: this.count }, () => []);
     for (const bucket of this.#buckets) {
+      if (bucket.index < oldest) continue;
       const at = bucket.index * this.widthS;
       times.push(at, at + this.widthS / 2);
       for (let curve = 0; curve < this.count; curve += 1) {
@@ -52,6 +52,16 @@ export class Curves {
     return [times, ...values];
   }
 
+  /** Number of buckets that are kept. */
+  get size() {
+    return this.#buckets.length;
+  }
+
+  /** Forget everything. */
+  clear() {
+    this.#buckets = [];
+  }
+
   #bucket(index) {
     const buckets = this.#buckets;
     let at = buckets.length;
@@ -59,6 +69,8 @@ export class Curves {
     if (at && buckets[at - 1].index === index) return buckets[at - 1];
     const bucket = { index, first: new Array(this.count), second: new Array(this.count), seen: new Array(this.count) };
     buckets.splice(at, 0, bucket);
+    // Here, and not when they are drawn: a hidden page draws nothing for days.
+    while (buckets[0].index < buckets.at(-1).index - BUCKETS - 1) buckets.shift();
     return bucket;
   }
 }

@@ -85,7 +85,7 @@ export function setPanel(panel, scope) {
     h("div", { class: "entry" },
       h("label", { class: "unseen", for: id }, t("set_new_value", { name: panel.title || panel.of })),
       steps[0], field.element, steps[1], h("span", { class: "unit" }, unit), button),
-    panel.comment === "none" ? null : h("div", { class: "entry" },
+    panel.comment === "none" ? null : h("div", { class: "entry comment" },
       h("label", { for: `${id}-comment` }, t(panel.comment === "required" ? "set_comment_required" : "set_comment")), comment),
     hint, result);
 

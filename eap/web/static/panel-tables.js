@@ -89,7 +89,7 @@ function busPart(name, parent) {
     const isCut = bus.ring?.is_whole === false;
     const facts = [
       t("slaves_in_op", { op: inOp, all: present.length }),
-      t("bus_lost", { lost: bus.lost, wkc: bus.wkc_errors }),
+      bus.lost || bus.wkc_errors ? t("bus_lost", { lost: bus.lost, wkc: bus.wkc_errors }) : t("bus_none_lost"),
       bus.trip_us != null && t("bus_trip", { trip: formatDuration(bus.trip_us) }),
     ];
     setText(state, facts.filter(Boolean).join(" · "));
@@ -172,6 +172,7 @@ function routeCells(route) {
 export function variablesPanel(panel, scope) {
   const { app } = scope;
   const names = resolve(panel.of, app.variables, app.stations).filter((name) => describe(name, app.variables));
+  const isOfOne = new Set(names.map(stationOf)).size === 1; // its name is in the heading
   const { frame, body } = table(t("variables"), [t("variable"), { text: t("value"), number: true }, t("unit"), { text: t("age"), number: true }, t("last_minute"), t("type"), t("comment")], { class: "variables" });
   const filter = h("input", { type: "search", id: "filter", placeholder: t("filter_example"), autocomplete: "off" });
   const count = h("span", { class: "note", role: "status" });
@@ -188,7 +189,7 @@ export function variablesPanel(panel, scope) {
       return wanted.every((word) => text.includes(word));
     });
     const shown = fitting.slice(0, MOST_ROWS);
-    body.replaceChildren(...shown.map((name) => variableRow(name, rowScope, sparklines, visible)));
+    body.replaceChildren(...shown.map((name) => variableRow(name, rowScope, sparklines, visible, isOfOne)));
     setText(count, fitting.length > shown.length
       ? t("variables_some", { shown: shown.length, all: fitting.length })
       : t("variables_count", { count: fitting.length }));
@@ -212,7 +213,7 @@ export function variablesPanel(panel, scope) {
   return h("div", {}, h("p", { class: "filter" }, h("label", { for: "filter" }, t("filter")), " ", filter, " ", count), frame);
 }
 
-function variableRow(name, scope, sparklines, visible) {
+function variableRow(name, scope, sparklines, visible, isOfOne) {
   const { app } = scope;
   const described = describe(name, app.variables);
   const value = h("td", { class: "number" });
@@ -220,7 +221,7 @@ function variableRow(name, scope, sparklines, visible) {
   const sparkline = sparklines.get(name) ?? new Sparkline();
   sparklines.set(name, sparkline);
   const row = h("tr", {},
-    h("th", { scope: "row" }, h("a", { href: hrefOf("variable", name) }, name)), value, h("td", {}, described.unit), age,
+    h("th", { scope: "row" }, h("a", { href: hrefOf("variable", name), title: name }, isOfOne ? name.slice(stationOf(name).length + 1) : name)), value, h("td", {}, described.unit), age,
     h("td", { class: "spark", "aria-hidden": "true" }, sparkline.element),
     h("td", { class: "type" }, typeName(described.type)), h("td", { class: "comment" }, described.comment));
   row.sparkline = sparkline;

@@ -29,7 +29,11 @@ let count = 0;
 /** Return the element of one panel. */
 function panelElement(panel, scope, path) {
   const id = `panel-${(count += 1)}`;
-  return h("section", { class: `panel panel-${panel.kind}`, "aria-labelledby": id }, h("h2", { id }, panel.title || titleOf(panel)), PANELS[panel.kind](panel, scope, path));
+  const made = PANELS[panel.kind](panel, scope, path);
+  const { element, tools } = made instanceof Node ? { element: made } : made;
+  const heading = h("h2", { id }, panel.title || titleOf(panel));
+  const head = tools ? h("div", { class: "head" }, heading, h("div", { class: "tools" }, tools)) : heading;
+  return h("section", { class: `panel panel-${panel.kind}`, "aria-labelledby": id }, head, element);
 }
 
 function titleOf({ kind, of }) {
@@ -95,11 +99,12 @@ function variableView(name, scope) {
   if (/^(U?[SDL]?INT|L?REAL|BOOL|BIT|BYTE|D?WORD|LWORD)/.test(described.type) || name !== baseName(name, app)) {
     panels.push({ kind: "trend", of: name, window: "10m" });
   }
-  const element = panelsView(name, panels, scope);
+  const made = panels.map((panel) => panelElement(panel, scope, ""));
   const fact = (term, text) => (text ? [h("dt", {}, term), h("dd", {}, text)] : []);
-  element.append(h("section", { class: "panel" }, h("h2", {}, t("about")), h("dl", {},
+  const about = h("section", { class: "panel panel-about" }, h("h2", {}, t("about")), h("dl", {},
     h("dt", {}, t("station")), h("dd", {}, h("a", { href: hrefOf("station", stationOf(name)) }, stationOf(name))),
-    fact(t("type"), typeName(described.type)), fact(t("unit"), described.unit), fact(t("comment"), described.comment), fact(t("written_by"), tn("writer", described.writer)))));
+    fact(t("type"), typeName(described.type)), fact(t("unit"), described.unit), fact(t("comment"), described.comment), fact(t("written_by"), tn("writer", described.writer))));
+  const element = h("div", { class: "variable" }, h("h1", {}, name), h("div", { class: "panels" }, made, about));
   return { title: name, element, topics: [`values:${name}`] };
 }
 
@@ -127,7 +132,8 @@ function loginView(scope) {
       button.disabled = false;
     }
   });
-  const isPossible = app.session?.can_log_in;
-  const element = h("div", {}, h("h1", {}, t("log_in")), h("section", { class: "panel panel-login" }, isPossible ? form : h("p", {}, t("login_by_proxy"))));
+  const { can_log_in: isPossible, role } = app.session;
+  const reason = role ? t("login_none", { role: tn("role", role) }) : t("login_by_proxy");
+  const element = h("div", {}, h("h1", {}, t("log_in")), h("section", { class: "panel panel-login" }, isPossible ? form : h("p", {}, reason)));
   return { title: t("log_in"), element, topics: [], focus: user };
 }

@@ -90,6 +90,11 @@ def test_the_next_report_has_its_own_numbers(writer: MetricsWriter) -> None:
     assert value(gone, "eap_frame_sent_total", **where) is None
 
 
+def test_silent_appliances_are_counted(writer: MetricsWriter) -> None:
+    found = samples(writer.write(report(), 2))
+    assert found["eap_unreachable", frozenset()] == 2
+
+
 def test_every_family_has_help_and_a_name_with_its_unit() -> None:
     names = [family.name for family in FAMILIES]
     assert len(names) == len(set(names))

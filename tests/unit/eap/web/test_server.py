@@ -470,6 +470,15 @@ def test_rate_of_a_host_is_limited(monkeypatch):
     play(script)
 
 
+def test_browser_that_opens_many_tabs_gets_all_files():
+    async def script(found: Site) -> None:
+        client = await found.client()
+        statuses = {(await client.get("/app.js")).status for _ in range(300)}
+        assert statuses == {200}
+
+    play(script)
+
+
 def test_hosts_behind_a_proxy_have_rates_of_their_own(monkeypatch):
     monkeypatch.setattr(guard, "_RATE", (2, 0.001))
 
@@ -667,6 +676,33 @@ def test_values_grow_stale_while_the_plant_does_not_answer_and_come_back():
             assert answer.status == 503
         found.plant.answers = True
         await until(stale=False)
+
+    play(script)
+
+
+def test_metrics_count_plants_that_do_not_answer():
+    async def script(found: Site) -> None:
+        client = await found.client()
+        while "eap_unreachable{} 0\n" not in await (await client.get("/metrics")).text():
+            pass
+        found.plant.answers = False
+        while "eap_unreachable{} 1\n" not in await (await client.get("/metrics")).text():
+            pass
+
+    play(script)
+
+
+def test_silent_station_hides_no_other_from_wildcards():
+    async def script(found: Site) -> None:
+        client = await found.client()
+        before = found.server.feed.directories["mixer"]
+        found.server.feed.directories["mill"] = before  # another appliance, which has ended
+        values = await (await client.get("/api/v1/*/speed")).json()
+        assert values["mixer/speed"]["value"] == 50.5
+        assert values["mill/speed"]["value"] is None
+        assert values["mill/speed"]["stale"]
+        async with client.get("/api/v1/mill/speed") as answer:
+            assert (answer.status, await reason(answer)) == (503, "station mill does not answer")
 
     play(script)
 
