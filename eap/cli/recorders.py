@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from datetime import datetime
 from pathlib import Path
@@ -17,69 +16,52 @@ from eap.quantities import count, duration
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from eap.config.record_texts import Distance, Division
     from eap.runtime.recordings import RecordingState
-
-_SECONDS = {"ms": 0.001, "s": 1, "m": 60, "min": 60, "h": 3600, "d": 86400}
-_BYTES = {"KB": 1000, "MB": 1000**2, "GB": 1000**3}
-_AMOUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([A-Za-z]*)")
-_DAY_NS = 86_400 * 10**9
-_LONGEST_NS = 3650 * _DAY_NS
-_LONGEST_RING_NS = _DAY_NS
-_MOST_CYCLES = 10**9
-_BEFORE_NS, _AFTER_NS = 20 * 10**9, 10 * 10**9
 
 
 class Seconds(click.ParamType[int]):
-    """A time such as ``20s``, ``500ms``, ``1h`` or ``10``, which is in seconds; in nanoseconds."""
+    """A time such as ``20s``, ``500ms``, ``1h`` or ``10``, which is in seconds; in nanoseconds.
+
+    Args:
+        is_of_ring: Whether it is a time in memory, which is bounded.
+    """
 
     name = "time"
 
-    def __init__(self, longest_ns: int = _LONGEST_NS) -> None:
-        self._longest_ns = longest_ns
+    def __init__(self, *, is_of_ring: bool = False) -> None:
+        self._is_of_ring = is_of_ring
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         """Return nanoseconds."""
+        from eap.config.record_texts import parse_ring, parse_time
+
         if isinstance(value, int):
             return value
-        match = _AMOUNT.fullmatch(value.strip())
-        unit = _SECONDS.get(match[2].lower() or "s") if match else None
-        ns = int(float(match[1]) * unit * 1e9) if match and unit else 0
-        if not 0 < ns <= self._longest_ns:
-            longest = duration(self._longest_ns // 1000)
-            self.fail(
-                f"{value!r} is not a time: expected for example 20s, 500ms, 10min or 1h, {longest}"
-                " at most",
-                param,
-                ctx,
-            )
-        return ns
+        try:
+            return parse_ring(value) if self._is_of_ring else parse_time(value)
+        except ValueError as exc:
+            self.fail(str(exc), param, ctx)
 
 
-def _parse_every(ctx: click.Context, param: click.Parameter, text: str) -> tuple[int, int]:
-    """Return cycles and milliseconds, one of them 0."""
+def _parse_every(ctx: click.Context, param: click.Parameter, text: str) -> Distance:
+    from eap.config.record_texts import parse_every
+
     del ctx, param
-    match = re.fullmatch(r"(\d+)(ms)?", text.strip(), re.IGNORECASE)
-    number = int(match[1]) if match else 0
-    if match is None or not 0 < number <= _MOST_CYCLES:
-        raise click.BadParameter(f"{text!r}: expected cycles, such as 10, or a time such as 100ms")
-    return (1, number) if match[2] else (number, 0)
+    try:
+        return parse_every(text)
+    except ValueError as exc:
+        raise click.BadParameter(str(exc)) from None
 
 
-def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -> tuple[int, int]:
-    """Return nanoseconds and bytes, one of them 0."""
+def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -> Division:
+    from eap.config.record_texts import Division, parse_split
+
     del ctx, param
-    if text is None:
-        return 0, 0
-    match = _AMOUNT.fullmatch(text.strip())
-    if match and (unit := _BYTES.get(match[2].upper())):
-        size = int(float(match[1]) * unit)
-        if size >= 1:
-            return 0, size
-    elif match and (seconds := _SECONDS.get(match[2].lower())):
-        ns = int(float(match[1]) * seconds * 1e9)
-        if 0 < ns <= _LONGEST_NS:
-            return ns, 0
-    raise click.BadParameter(f"{text!r}: expected a time such as 1h, or a size such as 1GB")
+    try:
+        return Division() if text is None else parse_split(text)
+    except ValueError as exc:
+        raise click.BadParameter(str(exc)) from None
 
 
 @click.command(
@@ -114,7 +96,7 @@ def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -
 @click.option(
     "--ring",
     "ring_ns",
-    type=Seconds(_LONGEST_RING_NS),
+    type=Seconds(is_of_ring=True),
     metavar="TIME",
     help="Keep the last TIME in memory, and write it on --when or 'record snapshot'.",
 )
@@ -122,7 +104,7 @@ def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -
 @click.option(
     "--before",
     "before_ns",
-    type=Seconds(_LONGEST_RING_NS),
+    type=Seconds(is_of_ring=True),
     metavar="TIME",
     help="With --when: time before that.  Default: that of --ring, else 20s.",
 )
@@ -157,13 +139,13 @@ def start(
     patterns: tuple[str, ...],
     target: Path | None,
     kind: str | None,
-    every: tuple[int, int],
+    every: Distance,
     for_ns: int | None,
     ring_ns: int | None,
     when: str | None,
     before_ns: int | None,
     after_ns: int | None,
-    split: tuple[int, int],
+    split: Division,
     keep: int | None,
     to: str | None,
     plant: str | None,
@@ -178,57 +160,39 @@ def start(
 
     The recorder goes on when the terminal is closed, and over restarts of the plant.
     """
+    from eap.config.record_texts import RecordTimes, completed, find_contradiction
     from eap.expressions import Condition
     from eap.ops.recorders import start_recording
     from eap.recording.recorder import RecorderOptions
 
-    _check_options(kind, every, ring_ns, when, before_ns, after_ns)
-    if to and (kind == "frames" or ring_ns or when or split != (0, 0) or keep):
-        raise click.UsageError("--to takes values as they come: without --frames, a ring, or files")
+    times = RecordTimes(ring_ns or 0, before_ns or 0, after_ns or 0)
+    has_files = any(split) or bool(keep)
+    kind = kind or "values"
+    found = find_contradiction(kind, every, times, when or "", to or "", has_files=has_files)
+    if found:
+        raise click.UsageError(f"--{found[0]}: {found[1]}")
     if when is not None:
         try:
             Condition(when)
         except ValueError as exc:
             raise click.UsageError(str(exc)) from None
-        before_ns = before_ns or ring_ns or _BEFORE_NS
-        after_ns = after_ns or _AFTER_NS
-        ring_ns = max(ring_ns or 0, before_ns)
+    times = completed(times, when or "")
     options = RecorderOptions(
         name="",
-        kind=kind or "values",
+        kind=kind,
         base="",
         plant="",
         folder="",
         patterns=patterns,
-        every_cycles=every[0],
-        every_ms=every[1],
+        **every._asdict(),
+        **times._asdict(),
+        **split._asdict(),
         for_ns=for_ns or 0,
-        ring_ns=ring_ns or 0,
         when=when or "",
-        before_ns=before_ns or 0,
-        after_ns=after_ns or 0,
-        split_ns=split[0],
-        split_bytes=split[1],
         keep=keep or 0,
         to=to or "",
     )
     output.show(start_recording(options, plant, target), _started)
-
-
-def _check_options(
-    kind: str | None,
-    every: tuple[int, int],
-    ring_ns: int | None,
-    when: str | None,
-    before_ns: int | None,
-    after_ns: int | None,
-) -> None:
-    if kind == "frames" and every != (1, 0):
-        raise click.UsageError("--every is for values: frames are recorded as they come")
-    if when is None and (before_ns or after_ns):
-        raise click.UsageError("--before and --after need --when CONDITION")
-    if ring_ns and before_ns and before_ns > ring_ns:
-        raise click.UsageError("--before is longer than --ring")
 
 
 def _started(state: RecordingState) -> str:
@@ -268,7 +232,8 @@ def stop(name: str | None, stops_all: bool, output: Renderer) -> None:
 
     if name and stops_all:
         raise click.UsageError("NAME and --all contradict each other")
-    names = running_names() if stops_all else [name or only_recording(running_names())]
+    running = running_names(stoppable=True)
+    names = running if stops_all else [name or only_recording(running)]
     output.show_rows((stop_recording(each) for each in names), _ended)
 
 

@@ -52,6 +52,8 @@ from eap.config.index import Index, SentPd, VariablePart
 from eap.config.links import check_links, ends, execution_order, is_bitwise
 from eap.config.plant_sections import HostSection, PlantFile
 from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
+from eap.config.record import check_recordings, records_of, resolved_recordings
+from eap.config.record_sections import RecordSection
 from eap.config.routes import (
     check_routes,
     find_hop,
@@ -490,6 +492,8 @@ class Plant(msgspec.Struct, frozen=True):
     """Page for browsers, with resolved paths; None without one."""
     metrics: MetricsSection | None = None
     """Metrics without a page, with resolved paths; None without them."""
+    record: tuple[RecordSection, ...] = ()
+    """Recordings that run beside the plant, with resolved paths."""
     bridges: Mapping[str, Section] = {}
     """Sections of the bridges, by their keys, with resolved paths."""
 
@@ -501,6 +505,7 @@ class Plant(msgspec.Struct, frozen=True):
             stations=tuple(each for each in self.stations if each.name in host.stations),
             web=web if web is None or is_served_on(host, web.listen) else None,
             metrics=metrics if metrics is None or is_served_on(host, metrics.listen) else None,
+            record=tuple(each for each in self.record if records_of(each, host.stations)),
         )
 
 
@@ -543,6 +548,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
     check_access(index, report, path.parent)
     check_web(index, report, path.parent)
     check_hosts(index, report)
+    check_recordings(index, report)
     # Derived only from a plant without findings, so nothing below can fail.
     if findings := report.findings():
         return PlantResult(None, findings)
@@ -555,6 +561,7 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
         hosts=plant_file.hosts,
         web=plant_file.web and resolved(plant_file.web, path.parent),
         metrics=plant_file.metrics and resolved_tls(plant_file.metrics, path.parent),
+        record=resolved_recordings(plant_file.record, path.parent),
     )
     warnings = (
         *report.warnings,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from eap.config.record_sections import RecordSection
 from eap.config.structs import Defaults, PlantAccess, Section, StationSection, TypeSection
 from eap.config.web_sections import MetricsSection, WebSection
 
@@ -36,3 +37,4 @@ class PlantFile(Section, frozen=True, kw_only=True):
     hosts: tuple[HostSection, ...] = ()
     web: WebSection | None = None
     metrics: MetricsSection | None = None
+    record: tuple[RecordSection, ...] = ()

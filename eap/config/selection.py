@@ -49,7 +49,7 @@ class VariableNames:
         """Report a name that is unknown, and a pattern that no variable fits, nor one of *more*."""
         if "*" not in name and name not in more:
             self.find(path, name)
-        elif not match_names(name, [*self.names, *more]) and not self._may_be_on_bus(name):
+        elif not match_names(name, [*self.names, *more]) and not self.may_be_on_bus(name):
             self._report.add(path, f"no variable fits {name!r}", _OF)
 
     def find(self, path: str, name: str) -> tuple[StationSection, str] | None:
@@ -72,16 +72,14 @@ class VariableNames:
         return None
 
     def _has(self, station: StationSection, variable: str) -> bool:
-        if variable in self.known[station.name] or self._may_be_on_bus(
-            f"{station.name}/{variable}"
-        ):
+        if variable in self.known[station.name] or self.may_be_on_bus(f"{station.name}/{variable}"):
             return True
         try:
             return self._index.part(station, variable) is not None
         except ValueError:
             return variable.partition(".")[0].partition("[")[0] in self._report.broken
 
-    def _may_be_on_bus(self, name: str) -> bool:
+    def may_be_on_bus(self, name: str) -> bool:
         """Return whether *name* is of a bus whose file could not be read."""
         station_name, _, variable = name.partition("/")
         station = self._index.stations.get(station_name)

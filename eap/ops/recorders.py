@@ -97,9 +97,13 @@ def snapshot_recording(name: str) -> RecordingState:
     return _ask(name, RecorderRequest(do="snapshot"))
 
 
-def running_names() -> list[str]:
-    """Return the names of the recordings that run."""
-    return [state.name for _, state in find_recordings() if not state.is_over]
+def running_names(*, stoppable: bool = False) -> list[str]:
+    """Return the names of the recordings that run, with *stoppable* those of no plant file."""
+    return [
+        state.name
+        for _, state in find_recordings()
+        if not state.is_over and not (stoppable and state.is_of_plant)
+    ]
 
 
 def _require_packages(options: RecorderOptions) -> None:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from eap.closeable import Closeable
 from eap.codec import datatypes
+from eap.config.record_texts import COUNTERS
 from eap.errors import ImageError
 from eap.net.framering_file import AttachedRing
 from eap.net.image_file import ImageFile, open_image
@@ -65,8 +66,11 @@ class Look(NamedTuple):
 
 def unix_offset_ns() -> int:
     """Return how far Unix time is from the monotonic clock."""
-    # An interruption between the two readings makes the distance look larger: the smallest counts.
-    return min(time_ns() - monotonic_ns() for _ in range(3))
+    # Unix time is read between two readings of the other clock.  An interruption comes in between,
+    # too: the readings that are closest to each other are right.
+    readings = ((monotonic_ns(), time_ns(), monotonic_ns()) for _ in range(3))
+    first_ns, unix_ns, last_ns = min(readings, key=lambda each: each[2] - each[0])
+    return unix_ns - (first_ns + last_ns) // 2
 
 
 def samples_in(block: CapturedBlock) -> Iterator[tuple[int, int, bytes]]:
@@ -236,8 +240,6 @@ class PortCapture(Closeable):
         return Look(blocks, gaps)
 
 
-COUNTERS = ("lost", "late", "duplicated", "reordered", "timeouts", "dropped", "skipped", "overruns")
-"""Names of counters that a condition may have, alone or as ``STATION/NAME``."""
 _TRACKED = {
     "lost": RxWord.LOST,
     "late": RxWord.LATE,

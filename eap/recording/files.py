@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Protocol, TypeAlias
 
-from eap.errors import EapError
+from eap.errors import EapError, EnvironmentalError
 from eap.recording.capture import CapturedBlock, Gap
 from eap.recording.header import RecordingEvent
 
@@ -72,6 +73,7 @@ class FileSequence:
         split_ns: Longest time of a file; 0 for no limit.
         split_bytes: Largest size of a file; 0 for no limit.
         keep: Number of files to keep; 0 for all.
+        continues: Whether files with numbers that are there belong to it: it goes on behind them.
         room: Bytes to leave free on the disk; None for the default.
 
     Attributes:
@@ -89,6 +91,7 @@ class FileSequence:
         split_ns: int = 0,
         split_bytes: int = 0,
         keep: int = 0,
+        continues: bool = False,
         room: int | None = None,
     ) -> None:
         self._base = base
@@ -106,6 +109,8 @@ class FileSequence:
         self.octets = 0
         self._finished = 0, 0
         """Messages and bytes of all files but the present one."""
+        if continues:
+            self._adopt()
 
     @property
     def is_open(self) -> bool:
@@ -117,9 +122,12 @@ class FileSequence:
 
         Raises:
             DiskFullError: there is no room.
+            EnvironmentalError: there is no folder.
             OSError: it cannot be made.
         """
         self.close(time_ns)
+        if not self._base.parent.is_dir():
+            raise EnvironmentalError(f"{self._base.parent}: no such folder: make it")
         path = self._next_path()
         self._check_room(path)
         self._file = make(path, time_ns)
@@ -193,6 +201,18 @@ class FileSequence:
         # Removed by somebody else, it still counts with what was known of it.
         with suppress(OSError):
             self.octets = self._finished[1] + self.paths[-1].stat().st_size
+
+    def _adopt(self) -> None:
+        base = self._base
+        name = re.compile(rf"{re.escape(base.name)}-(\d{{4,9}}){re.escape(self._ending)}")
+        try:
+            paths = list(base.parent.iterdir())
+        except OSError:  # the first file cannot be opened either, which has the reason
+            paths = []
+        matches = [(name.fullmatch(path.name), path) for path in paths]
+        found = sorted((int(match[1]), path) for match, path in matches if match)
+        self.paths = [path for _, path in found]
+        self._number = found[-1][0] if found else 0
 
     def _next_path(self) -> Path:
         while True:

@@ -1,12 +1,14 @@
 """The process of one recording: its loop, its requests and its end.
 
 ``eapctl record start`` starts it in a session of its own, so that it outlives the terminal.  It
-reports on stdout that it records, or why it does not, and closes that.  Requests come by a socket
-in its folder: a JSON line each, answered by one.
+reports on stdout that it records, or why it does not, and closes that.  The supervisor starts those
+of the plant file, which end with it.  Requests come by a socket in its folder: a JSON line each,
+answered by one.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import select
 import signal
@@ -20,9 +22,14 @@ from time import monotonic_ns
 
 import msgspec
 
-from eap.errors import EapError
+from eap.config.record_texts import KEEP, division_of, parse_every, times_of
+from eap.errors import EapError, EnvironmentalError
 from eap.recording.recorder import Recorder, RecorderOptions
+from eap.runtime.handover import RecorderHandover
 from eap.runtime.recordings import RecordingFolder, RecordingState, forget_old_recordings
+from eap.runtime.startup import Startup
+
+logger = logging.getLogger(__name__)
 
 _CHECK_NS = 500_000_000
 _MAX_LINE = 65_536
@@ -53,11 +60,13 @@ class RecorderProcess:
     Args:
         recorder: The recording.
         folder: Its folder, locked.
+        parent: Process without which it ends; 0 for none.
     """
 
-    def __init__(self, recorder: Recorder, folder: RecordingFolder) -> None:
+    def __init__(self, recorder: Recorder, folder: RecordingFolder, parent: int = 0) -> None:
         self._recorder = recorder
         self._folder = folder
+        self._parent = parent
         self._server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._server.bind(str(folder.control_socket))
         self._server.listen(_MAX_CLIENTS)
@@ -82,8 +91,8 @@ class RecorderProcess:
         is_reported = False
         while not recorder.is_over:
             now_ns = monotonic_ns()
-            if self._stops:
-                recorder.end("stopped", now_ns)
+            if reason := self._reason_to_end():
+                recorder.end(reason, now_ns)
                 break
             if now_ns >= look_ns:
                 look_ns = recorder.look(now_ns)
@@ -98,9 +107,19 @@ class RecorderProcess:
         state = self._describe(monotonic_ns())
         if not is_reported:
             report(RecorderAnswer(error=state.reason))
+        elif recorder.has_failed:
+            logger.error("%s", state.reason)  # the last line, which a supervisor shows
         for client in self._ending:
             self._answer(client, RecorderAnswer(state=state))
-        return 1 if recorder.has_failed else 0
+        if not recorder.has_failed:
+            return 0
+        return 1 if is_reported else 2
+
+    def _reason_to_end(self) -> str:
+        if self._stops:
+            return "stopped"
+        is_orphan = self._parent and os.getppid() != self._parent
+        return "the appliance ended" if is_orphan else ""
 
     def _describe(self, now_ns: int) -> RecordingState:
         """Write the state of the recording to its folder, and return it."""
@@ -155,6 +174,7 @@ class RecorderProcess:
         try:
             request = msgspec.json.decode(line, type=RecorderRequest)
             if request.do == "stop":
+                self._require_own_end()
                 self._ending.append(client)
                 self._stops = True
                 return
@@ -168,37 +188,87 @@ class RecorderProcess:
             answer = RecorderAnswer(error=str(exc))
         self._answer(client, answer)
 
+    def _require_own_end(self) -> None:
+        """Raise EnvironmentalError if the recording ends with the plant only."""
+        state = self._recorder.state
+        if state.is_of_plant:
+            raise EnvironmentalError(
+                f"recording {state.name!r} is in the plant file, so it ends with the plant: remove"
+                " it from the key 'record', and start the plant again"
+            )
+
     def _answer(self, client: socket.socket, answer: RecorderAnswer) -> None:
         with suppress(OSError):  # it may have gone
             client.send(msgspec.json.encode(answer) + b"\n")
         client.close()
 
 
-def main(arguments: list[str]) -> int:
+def main(descriptor: int, startup: Startup) -> int:
+    """Record as a recording of the plant file until SIGTERM, or until the supervisor ends."""
+    handover = RecorderHandover.from_descriptor(descriptor)
+
+    def report(answer: RecorderAnswer) -> None:
+        if answer.error:
+            startup.step(answer.error)
+        else:
+            startup.finish({})
+
+    return _record(plant_options(handover), report, handover.supervisor)
+
+
+def plant_options(handover: RecorderHandover) -> RecorderOptions:
+    """Return the options of a recording of the plant file."""
+    record = handover.record
+    return RecorderOptions(
+        name=record.name,
+        kind=record.kind,
+        base=str(Path(record.folder, record.name)),
+        plant=handover.plant,
+        folder=handover.folder,
+        patterns=record.patterns,
+        **parse_every(record.every)._asdict(),
+        **times_of(record)._asdict(),
+        **division_of(record)._asdict(),
+        when=record.when,
+        keep=0 if record.to else record.keep or KEEP,
+        to=record.to,
+        is_of_plant=True,
+    )
+
+
+def command_main(arguments: list[str]) -> int:
     """Record as ``arguments[0]``, RecorderOptions as JSON, says; return the exit code."""
     options = msgspec.json.decode(arguments[0], type=RecorderOptions)
     if options.to:
         # With its password, which arguments would show to all users of this host.
         options = msgspec.structs.replace(options, to=os.environ.pop(STORE_VARIABLE, options.to))
+    return _record(options, _report)
+
+
+def _record(
+    options: RecorderOptions, report: Callable[[RecorderAnswer], object], parent: int = 0
+) -> int:
+    """Record until the recording ends, or the process *parent*; return the exit code."""
     try:
         folder = RecordingFolder.claim(options.name)
     except EapError as exc:
-        _report(RecorderAnswer(error=str(exc)))
+        report(RecorderAnswer(error=str(exc)))
         return 2
     with folder:
         forget_old_recordings()
         try:
             recorder = Recorder(options, monotonic_ns())
         except EapError as exc:
-            _report(RecorderAnswer(error=str(exc)))
+            report(RecorderAnswer(error=str(exc)))
             return 2
         recorder.state.pid = os.getpid()
         folder.write(recorder.state)
-        process = RecorderProcess(recorder, folder)
+        process = RecorderProcess(recorder, folder, parent)
         signal.signal(signal.SIGTERM, process.stop)
         signal.signal(signal.SIGINT, process.stop)
-        _log_to(folder.log)
-        return process.run(_report)
+        if not parent:
+            _log_to(folder.log)
+        return process.run(report)
 
 
 def _report(answer: RecorderAnswer) -> None:
@@ -218,4 +288,4 @@ def _log_to(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(command_main(sys.argv[1:]))

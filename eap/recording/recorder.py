@@ -19,6 +19,7 @@ from typing import Any, TypeAlias
 import msgspec
 
 from eap.closeable import Closeable
+from eap.config.record_texts import matcher
 from eap.errors import EapError, EnvironmentalError, ImageError
 from eap.expressions import Condition
 from eap.net.image_file import open_image
@@ -39,7 +40,7 @@ from eap.recording.files import FileSequence, RecordingFile
 from eap.recording.header import EventKind, RecordingEvent
 from eap.recording.published import published_by
 from eap.recording.ring import BlockRing, RecordingTrigger, TriggerAction
-from eap.recording.selection import matcher, select_variables
+from eap.recording.selection import select_variables
 from eap.recording.sinks import FramesSink, ValuesSink, header_of, placed_variables
 from eap.recording.stores import StoreSequence, StoreSink, make_store, shown_url
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo
@@ -77,6 +78,9 @@ class RecorderOptions(msgspec.Struct, frozen=True, kw_only=True):
         keep: Number of files.
         for_ns: Time of the whole recording.
         to: URL of a store that takes the values instead of files.
+        room: Bytes to leave free on the disk; None for the default.
+        is_of_plant: Whether the plant file has it: it continues the files of earlier runs, and
+            ends with the plant.
     """
 
     name: str
@@ -97,6 +101,7 @@ class RecorderOptions(msgspec.Struct, frozen=True, kw_only=True):
     for_ns: int = 0
     to: str = ""
     room: int | None = None
+    is_of_plant: bool = False
 
     def texts(self) -> dict[str, str]:
         """Return those of the command line that were given, by name."""
@@ -276,6 +281,7 @@ class Recorder:
             plant=options.plant,
             started_at=(now_ns + offset_ns) / 1e9,
             options=options.texts(),
+            is_of_plant=options.is_of_plant,
         )
         self.is_over = False
         self._attached: Attachment | None = None
@@ -290,6 +296,7 @@ class Recorder:
                 Path(options.base),
                 ENDINGS[options.kind],
                 numbered=has_ring or bool(options.split_ns or options.split_bytes),
+                continues=options.is_of_plant,
                 split_ns=options.split_ns,
                 split_bytes=options.split_bytes,
                 keep=options.keep,

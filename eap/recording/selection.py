@@ -6,30 +6,14 @@ A pattern is ``STATION`` for all of a station, or ``STATION/NAME``; ``*`` stands
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
+from eap.config.record_texts import matcher
 from eap.errors import ControlError
 from eap.pd.layout import ImageLayout, VariableSlot
 from eap.suggest import suggest
 
 _LISTED = 6
-
-
-def matcher(patterns: Iterable[str]) -> Callable[[str], bool]:
-    """Return a function that says whether ``STATION/NAME`` is selected; all are without patterns.
-
-    Args:
-        patterns: As above.
-    """
-    parts = [_expression(each if "/" in each else f"{each}/*") for each in patterns]
-    found = re.compile("|".join(parts) if parts else ".*", re.DOTALL)
-    return lambda name: found.fullmatch(name) is not None
-
-
-def _expression(pattern: str) -> str:
-    signs = {"*": ".*", "?": "."}
-    return "".join(signs.get(each) or re.escape(each) for each in pattern)
 
 
 def select_variables(layout: ImageLayout, patterns: Sequence[str]) -> list[VariableSlot]:

@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from eap.codec.ethercat import EAP_PORT, FrameType
+from eap.config.record_texts import matcher
 from eap.ids import EAP_MULTICAST_MAC, Destination, DestinationKind, InterfaceUri, MacAddr, NetId
 from eap.net.busport import BUS_MULTICAST_MAC
 from eap.pd.address import from_word
@@ -19,7 +20,7 @@ from eap.recording.frames_writer import FramesWriter, Wrapping, ethernet_wrappin
 from eap.recording.header import AttachedFile, EventKind, RecordingEvent, RecordingHeader
 from eap.recording.messages import PlacedVariable, RecordedVariable
 from eap.recording.published import published_by
-from eap.recording.selection import matcher, select_variables
+from eap.recording.selection import select_variables
 from eap.recording.values_writer import ValuesWriter
 from eap.runtime.folder import ApplianceInfo
 

@@ -14,6 +14,7 @@ from time import monotonic
 from typing import Any, NamedTuple, Protocol
 from urllib.parse import urlsplit, urlunsplit
 
+from eap.config.record_texts import STORE_SCHEMES
 from eap.errors import ConfigError, EnvironmentalError
 from eap.pd.layout import ImageLayout
 from eap.recording.capture import CapturedBlock, Gap, samples_in
@@ -23,7 +24,6 @@ from eap.recording.messages import StationMessages
 from eap.recording.rows import ValueColumn, source_of
 from eap.recording.sinks import event_of, placed_variables
 
-SCHEMES = ("postgresql", "influx+http", "influx+https", "influx+udp")
 WAITING_BYTES = 256 << 20
 """Of rows that wait for the store; the oldest are lost beyond that."""
 _PAUSE_S = 1.0
@@ -73,7 +73,7 @@ class Store(Protocol):
 def check_url(url: str) -> None:
     """Raise ConfigError if *url* is none of a store."""
     parts = urlsplit(url)
-    if parts.scheme not in SCHEMES or not parts.hostname:
+    if parts.scheme not in STORE_SCHEMES or not parts.hostname:
         raise ConfigError(
             f"--to {shown_url(url)}: expected a store such as postgresql://host/database,"
             " influx+http://host:8086/api/v2/write?org=o&bucket=b or influx+udp://host:8089"

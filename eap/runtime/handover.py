@@ -13,6 +13,7 @@ from typing import Self
 import msgspec
 
 from eap.ams.spec import DirectoryStation, RoutingSpec
+from eap.config.record_sections import RecordSection
 from eap.config.web_sections import MetricsSection, WebSection
 from eap.ids import decode_value, encode_value
 from eap.pd.device import DeviceState
@@ -184,6 +185,17 @@ class BridgeHandover(InheritedRecord, frozen=True):
     """Key of the plant file."""
     section: msgspec.Raw
     """Its section with resolved paths, as JSON: only the bridge knows the type."""
+
+
+class RecorderHandover(InheritedRecord, frozen=True):
+    """All that the recorder of a recording of the plant file gets."""
+
+    supervisor: int
+    """Process id, as in Handover."""
+    folder: str
+    """The appliance's runtime folder."""
+    plant: str
+    record: RecordSection
 
 
 class EngineOptions(SpecRecord, frozen=True):

@@ -58,6 +58,7 @@ class RecordingState(msgspec.Struct, kw_only=True):
         ring_is_cut: Whether the ring is shorter than wanted, for want of memory.
         files: Those that there are, the newest last.
         options: Of the command.
+        is_of_plant: Whether the plant file has it; it ends with the plant.
     """
 
     name: str
@@ -79,6 +80,7 @@ class RecordingState(msgspec.Struct, kw_only=True):
     ring_is_cut: bool = False
     files: list[str] = []
     options: dict[str, str] = {}
+    is_of_plant: bool = False
 
     @property
     def is_over(self) -> bool:
@@ -203,7 +205,8 @@ def _finding(state: RecordingState, now_s: float) -> dict[str, Any] | None:
     severity, advice, since = "info", "", None
     what = f"{state.state}, {count(state.selected, _THINGS[state.kind])}"
     if state.is_over:
-        if not state.failed or now_s - (state.ended_at or 0) > SHOWN_S:
+        # The supervisor reports the process of a recording of the plant, and starts it again.
+        if state.is_of_plant or not state.failed or now_s - (state.ended_at or 0) > SHOWN_S:
             return None
         severity, since = "warning", state.ended_at
         what = f"{state.state}: {state.reason}"

@@ -41,6 +41,7 @@ from eap.runtime.handover import (
     EngineOptions,
     Handover,
     InheritedRecord,
+    RecorderHandover,
     SegmentHandover,
     WebHandover,
 )
@@ -79,6 +80,7 @@ class _Extra(NamedTuple):
 _EXTRAS = {
     "web": _Extra("eap.web.process", "aiohttp", "web"),
     "metrics": _Extra("eap.web.process", "aiohttp", "web"),
+    "recording": _Extra("eap.recording.process", "mcap", "record"),
 }
 """Optional processes by their keys in the plant file."""
 SEGMENT_GRACE_NS = 500_000_000
@@ -450,7 +452,7 @@ class Supervisor:
 
     def _start_extra(self, child: Child) -> None:
         self._restart_ns.pop(child, None)
-        _, needs, extra = _EXTRAS[child.name]
+        _, needs, extra = _EXTRAS[_kind_of(child.name)]
         if find_spec(needs) is None:
             # Only another installation changes this: without a restart it is not tried again.
             child.fault = f"{needs} is not installed: pip install 'eap-appliance[{extra}]'"
@@ -587,7 +589,18 @@ def _optional_processes(
     for name, section in plant.bridges.items():
         raw = msgspec.Raw(msgspec.json.encode(section, enc_hook=encode_value))
         handovers[name] = BridgeHandover(own, str(folder.path), plant.name, name, raw)
-    return {Child(name, _EXTRAS[name].module, bytecode): each for name, each in handovers.items()}
+    for record in plant.record:
+        handover = RecorderHandover(own, str(folder.path), plant.name, record)
+        handovers[f"recording {record.name}"] = handover
+    return {
+        Child(name, _EXTRAS[_kind_of(name)].module, bytecode): each
+        for name, each in handovers.items()
+    }
+
+
+def _kind_of(process: str) -> str:
+    """Return the kind of an optional process, of which there may be several."""
+    return process.partition(" ")[0]
 
 
 def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:

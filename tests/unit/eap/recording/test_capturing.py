@@ -22,6 +22,7 @@ from eap.recording.capture import (
     find_name,
     frames_in,
     samples_in,
+    unix_offset_ns,
 )
 from eap.recording.condition import ConditionWatch
 from tests.support.samplingengine import SamplingEngine
@@ -216,3 +217,12 @@ def test_condition_is_evaluated_for_each_cycle_and_for_grown_counters(engine, tm
         receiver.image.words[slot.words + RxWord.LOST] += 3
         assert [is_true for _, is_true in watch.look(0)] == [True]
         assert [is_true for _, is_true in watch.look(0)] == [False]
+
+
+def test_distance_of_the_clocks_ignores_interrupted_readings(monkeypatch):
+    # Readings of one clock, in order; 5 ms pass behind the first, and within the second try.
+    clock = iter([100, 100 + 5 * MS, 6 * MS, 6 * MS + 20, 7 * MS, 12 * MS])
+    unix = iter([10**18 + 150, 10**18 + 6 * MS + 10, 10**18 + 11 * MS])
+    monkeypatch.setattr("eap.recording.capture.monotonic_ns", lambda: next(clock))
+    monkeypatch.setattr("eap.recording.capture.time_ns", lambda: next(unix))
+    assert unix_offset_ns() == 10**18

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from eap.errors import EnvironmentalError
 from eap.recording.capture import CapturedBlock, Gap
 from eap.recording.disk import DiskThread
 from eap.recording.files import ROOM_BYTES, DiskFullError, FileSequence, room_on
@@ -202,3 +203,24 @@ def test_blocks_that_the_disk_cannot_take_in_time_are_refused(tmp_path, monkeypa
         assert disk.write(CapturedBlock("a", 0, 0, bytes(10)))
     finally:
         disk.end(0)
+
+
+def test_sequence_that_continues_goes_on_behind_the_files_that_are_there(tmp_path):
+    for name in ("line-0007.dat", "line-0009.dat", "line-10000.dat", "line-x.dat", "line.dat"):
+        (tmp_path / name).write_bytes(b"old")
+    files = Files(tmp_path, numbered=True, continues=True, keep=3)
+    files.sequence.open(files.make, 0)
+    assert [path.name for path in files.sequence.paths] == [
+        "line-0009.dat",
+        "line-10000.dat",
+        "line-10001.dat",
+    ]
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"line-0009.dat", "line-10000.dat", "line-10001.dat", "line-x.dat", "line.dat"}
+
+
+def test_folder_that_is_missing_is_the_reason_that_a_file_cannot_be_opened(tmp_path):
+    files = Files(tmp_path / "gone", numbered=True, continues=True)
+    with pytest.raises(EnvironmentalError, match="gone: no such folder: make it"):
+        files.sequence.open(files.make, 0)
+    assert files.opened == []

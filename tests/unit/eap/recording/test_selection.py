@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from eap.config.record_texts import matcher
 from eap.errors import ControlError
 from eap.pd.layout import plan_layout
-from eap.recording.selection import check_patterns, matcher, select_variables
+from eap.recording.selection import check_patterns, select_variables
 from tests.unit.eap.conftest import left
 
 NAMES = ["left/ticks", "left/bus0.a[1]", "left-2/ticks", "right/ticks"]
