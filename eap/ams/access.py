@@ -37,7 +37,7 @@ from eap.ads.request import (
 from eap.ams.error_reply import RoutingError
 from eap.ams.record import Outcome, Record, Trace, describe
 from eap.ams.spec import IP_TRANSPORTS, AccessRule, AccessService, ObjectRange, TransportKind
-from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.ads import AdsError, ConfigureOffset, IndexGroup
 from eap.codec.adsnotification import AddNotification
 from eap.codec.ams import AmsCommand, AmsHeader
 from eap.codec.eoe import READS as EOE_READS
@@ -48,7 +48,12 @@ _MAX_KNOWN = 4096
 
 _RAW = frozenset((IndexGroup.RAW_COMMAND, IndexGroup.VOE, IndexGroup.EOE, *SUM_COMMANDS))
 """Sum commands: one inside another, which is not parsed."""
-_FILES = frozenset((IndexGroup.FOE_OPEN_WRITE, IndexGroup.FOE_WRITE))
+_OF_GROUP: dict[int, AccessService] = {
+    IndexGroup.FOE_OPEN_WRITE: AccessService.FILES,
+    IndexGroup.FOE_WRITE: AccessService.FILES,
+    IndexGroup.CONFIGURE: AccessService.CONFIGURE,
+}
+"""Services of groups that have one of their own."""
 _STATES = frozenset((IndexGroup.MASTER_STATE, IndexGroup.SLAVE_STATES))
 _OWN_HANDLES = frozenset((IndexGroup.RELEASE_HANDLE, IndexGroup.FOE_CLOSE))
 LOOKUPS = frozenset(
@@ -68,6 +73,7 @@ LOOKUPS = frozenset(
 )
 """Groups whose ReadWrite changes only the client's own handles."""
 
+_CONFIGURE_READS = frozenset(each for each in ConfigureOffset if not each.is_change)
 
 # A tuple: a union would be built at each call.
 _ADDRESSED = (Read, Write, ReadWrite, AddNotification)
@@ -85,8 +91,8 @@ def service_of(operation: Operation) -> AccessService:
     if group in _RAW:
         is_read = group == IndexGroup.EOE and is_exchange and operation.offset in EOE_READS
         return AccessService.READ if is_read else AccessService.RAW
-    if group in _FILES:
-        return AccessService.FILES
+    if group in _OF_GROUP:
+        return _OF_GROUP[group]
     if group in (LOOKUPS if is_exchange else _OWN_HANDLES):
         return AccessService.READ
     return AccessService.CONTROL if group in _STATES else AccessService.WRITE
@@ -296,11 +302,16 @@ class AuditedOperation(NamedTuple):
         """True if the audit has it: it changed something, or was refused."""
         if not self.decision.is_allowed:
             return True
-        if self.decision.service is AccessService.READ:
+        if self.decision.service is AccessService.READ or _is_look_at_configuration(self.operation):
             return False
         # Of a file only the opening is audited: a megabyte is a thousand writes.
         is_piece = getattr(self.operation, "group", None) == IndexGroup.FOE_WRITE
         return not is_piece or bool(self.result)
+
+
+def _is_look_at_configuration(operation: Operation | AddRoute) -> bool:
+    group = getattr(operation, "group", None)
+    return group == IndexGroup.CONFIGURE and getattr(operation, "offset", 0) in _CONFIGURE_READS
 
 
 class AuditEntry(NamedTuple):

@@ -119,6 +119,9 @@ class AccessService(StrEnum):
     """FoE opened for write, and what is written to it."""
     RAW = "raw"
     """EtherCAT commands for a bus, VoE, and what cannot be understood."""
+    CONFIGURE = "configure"
+    """``plan``, ``apply`` and ``rollback`` by ADS: the configuration of a station, its access
+    rules included."""
 
 
 class ObjectRange(SpecStruct, frozen=True):

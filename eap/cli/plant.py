@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import click
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from eap.config.load import Plant
     from eap.control.device import ObjectChange
     from eap.ops.check import CheckedBus, CheckedPlant
-    from eap.ops.plant import ChangeReport, PlanReport, PlantLink, StepOutcome
+    from eap.ops.plant import AwayHost, ChangeReport, PlanReport, PlantLink, StepOutcome
     from eap.pd.spec import StationSpec
 
 
@@ -258,13 +259,15 @@ def running_plant(
     """Connect to the running part of the plant in *file*, for the length of a block.
 
     Yields:
-        The connections, and the specifications of the *wanted* stations: of all that run here
-        unless some are named.
+        The connections, and the specifications of the *wanted* stations: of all that run here, or
+        on hosts that are reached, unless some are named.
     """
-    from eap.ops.plant import choose, link_to, load_or_raise
+    from eap.live.plant_hosts import link_to_hosts
+    from eap.ops.plant import choose, load_or_raise
 
-    plant = load_or_raise(file)
-    with link_to(plant, file) as link:
+    with link_to_hosts(load_or_raise(file), file) as (link, plant, notes):
+        for note in notes:
+            click.echo(note, err=True)
         yield link, choose(plant, link, wanted)
 
 
@@ -284,10 +287,12 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Ren
         plans = plan_all(link, wanted)
         is_possible = not any(each.refused for each in plans)
         order = steps_to(link, wanted) if is_possible else []
-        report = PlanReport.of(plans, order, () if stations else link.absent)
+        away = () if stations else link.away
+        report = PlanReport.of(plans, order, () if stations else link.absent, away)
+        hosts = link.hosts
     command = start_command(plant, report.absent)
-    output.show(report, lambda each: plan_lines(each, command))
-    if not is_possible:
+    output.show(report, lambda each: plan_lines(each, command, hosts))
+    if not report.ok:
         ctx.exit(ExitCode.FAILED)
 
 
@@ -308,17 +313,20 @@ def apply(
 
     Exits with 1 when a station refuses.
     """
-    from eap.ops.plant import apply_steps, plan_all, steps_to
+    from eap.ops.plant import apply_steps, cause_of_change, plan_all, steps_to
 
     with running_plant(plant, stations) as (link, wanted):
+        away = () if stations else link.away
         refusing = {each.station: each.refused for each in plan_all(link, wanted) if each.refused}
         # Without --keep-going one refusal stops all: no station changes before all have agreed.
-        is_on = keep_going or not refusing
+        is_on = keep_going or not (refusing or away)
         chosen = {name: spec for name, spec in wanted.items() if is_on and name not in refusing}
         # Receivers first: a receiver accepts a new layout beside the old one.
         order = steps_to(link, chosen)
-        steps = apply_steps(link, order, keep_going=keep_going, routed=chosen)
-        _run_steps(ctx, steps, link, refusing, output)
+        cause = cause_of_change(link)
+        steps = apply_steps(link, order, keep_going=keep_going, routed=chosen, cause=cause)
+        is_undone = len(set(link.hosts.values())) > 1 and not keep_going
+        _run_steps(ctx, steps, link, output, refusing, away, cause if is_undone else "")
 
 
 @click.command()
@@ -338,32 +346,43 @@ def rollback(
     from eap.ops.plant import roll_back
 
     with running_plant(plant, stations) as (link, wanted):
-        _run_steps(ctx, roll_back(link, tuple(wanted), keep_going=keep_going), link, {}, output)
+        steps = roll_back(link, tuple(wanted), keep_going=keep_going)
+        _run_steps(ctx, steps, link, output, away=() if stations else link.away)
 
 
 def _run_steps(
     ctx: click.Context,
     steps: Iterable[StepOutcome],
     link: PlantLink,
-    refusing: Mapping[str, list[str]],
     output: Renderer,
+    refusing: Mapping[str, list[str]] = MappingProxyType({}),
+    away: tuple[AwayHost, ...] = (),
+    undo: str = "",
 ) -> None:
-    """Run all steps, print each when it is done, and then the whole result."""
-    from eap.ops.plant import ChangeReport
+    """Run all steps, print each when it is done, and then the whole result.
 
-    taken: list[StepOutcome] = []
-    error: ControlError | None = None
-    try:
-        for step in steps:
-            taken.append(step)
-            if not output.is_json:
-                # As they are done: a change of many stations takes a while, and may be
-                # interrupted.
-                for line in _step_lines(step):
-                    write_text(line)
-    except ControlError as exc:
-        error = exc
-    report = ChangeReport.of(taken, refusing, error)
+    Args:
+        ctx: Of the command.
+        steps: The steps.
+        link: To the stations.
+        output: Prints the result.
+        refusing: Reasons of stations that cannot change while they run.
+        away: Hosts that are not reached.
+        undo: Name of the change that is taken back when it fails; empty to leave it.
+    """
+    from eap.ops.plant import ChangeReport, roll_back
+
+    taken, error = _take(steps, link, output)
+    undone: list[StepOutcome] = []
+    failed = error is not None or not all(step.outcome.ok for step in taken)
+    if undo and failed:
+        # All hosts or none: what was changed before the failure is taken back.
+        reached = link.reached()
+        away = reached.away
+        back = roll_back(reached, reached.stations, keep_going=True, cause=undo)
+        undone, interruption = _take(back, link, output, "taken back: ")
+        error = error or interruption
+    report = ChangeReport.of(taken, refusing, error, away, undone)
     output.show(report, lambda each: _end_lines(each, len(link.stations)))
     if error is not None:
         raise error
@@ -371,24 +390,60 @@ def _run_steps(
         ctx.exit(ExitCode.FAILED)
 
 
-def plan_lines(report: PlanReport, command: str) -> Iterator[str]:
-    """Yield the differences of each station, the steps, and the *command* for absent stations."""
+def _take(
+    steps: Iterable[StepOutcome], link: PlantLink, output: Renderer, prefix: str = ""
+) -> tuple[list[StepOutcome], ControlError | None]:
+    """Run *steps* and print them; return their outcomes, and the error that interrupted them."""
+    taken: list[StepOutcome] = []
+    try:
+        for step in steps:
+            taken.append(step)
+            if not output.is_json:
+                # As they are done: a change of many stations takes a while, and may be
+                # interrupted.
+                head, *lines = _step_lines(step, link.hosts)
+                write_text("\n".join((f"{prefix}{head}", *lines)))
+    except ControlError as exc:
+        return taken, exc
+    return taken, None
+
+
+def plan_lines(
+    report: PlanReport, command: str, hosts: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[str]:
+    """Yield the differences of each station, the steps, and the *command* for absent stations.
+
+    Args:
+        report: The result.
+        command: Starts the absent stations.
+        hosts: Host of each station, for a plant of several.
+    """
     plans = report.stations
     differing = [each for each in plans if each.differs]
     for each in differing:
-        yield each.station
+        yield _on_host(each.station, hosts)
         yield from (f"  {line}" for line in _change_lines(each.changes))
         yield from (f"  * {note}" for note in each.notes)
         yield from (f"  ! {reason}" for reason in each.refused)
     if differing:
         yield from _plan_summary(report)
-    else:
+    elif plans:
         names = [each.station for each in plans]
         all_of = f"{names[0]} is" if len(names) == 1 else f"all {len(names)} stations are"
         yield f"no differences: {all_of} as the file says"
     if report.absent:
         yield f"not running here: {', '.join(report.absent)}; start them with:"
         yield f"  {command}"
+    yield from _away_lines(report.away)
+
+
+def _on_host(station: str, hosts: Mapping[str, str]) -> str:
+    return f"{station} on {hosts[station]}" if station in hosts else station
+
+
+def _away_lines(away: Iterable[AwayHost]) -> Iterator[str]:
+    for host in away:
+        yield f"host {host.host} ({', '.join(host.stations)}): {host.reason}"
 
 
 def _plan_summary(report: PlanReport) -> Iterator[str]:
@@ -437,10 +492,10 @@ def _change_lines(changes: Sequence[ObjectChange]) -> Iterator[str]:
         yield change_text(change, f"{change.port}: {change.name}" if several else change.name)
 
 
-def _step_lines(step: StepOutcome) -> Iterator[str]:
+def _step_lines(step: StepOutcome, hosts: Mapping[str, str]) -> Iterator[str]:
     """Yield the result of one step."""
     outcome = step.outcome
-    yield f"{step.station} {step.why}: {'ok' if outcome.ok else 'refused'}"
+    yield f"{_on_host(step.station, hosts)} {step.why}: {'ok' if outcome.ok else 'refused'}"
     for line, result in zip(_change_lines(outcome.results), outcome.results, strict=True):
         yield f"  {line}  {'ok' if result.ok else result.reason}"
     yield from (f"  ! {reason}" for reason in outcome.refused)
@@ -451,22 +506,28 @@ def _end_lines(report: ChangeReport, stations: int) -> Iterator[str]:
 
     Args:
         report: The result.
-        stations: Number of stations that run here.
+        stations: Number of stations that are reached.
     """
     for each in report.refused:
         yield f"{each.station} cannot change while it runs"
         yield from (f"  ! {reason}" for reason in each.refused)
+    yield from _away_lines(report.away)
     refused = [step.station for step in report.steps if not step.ok]
+    taken_back = {step.station for step in report.undone if step.ok}
     changed = list(dict.fromkeys(step.station for step in report.steps if step.ok))
+    left = [name for name in changed if name not in taken_back]
     if not changed:
         yield "no station changed"
         return
-    others = stations - len(changed)
+    if taken_back and not left:
+        yield f"no station changed: taken back at {', '.join(n for n in changed)}"
+        return
+    others = stations - len(left)
     rest = f", {others} unchanged" if others else ""
-    yield f"{count(len(changed), 'station')} changed{rest}"
+    yield f"{count(len(left), 'station')} changed{rest}"
     if refused or report.error is not None:
         what = f"{', '.join(refused)} refused" if refused else "interrupted"
-        yield f"{what}: changed so far: {', '.join(changed)}"
+        yield f"{what}: changed so far: {', '.join(left)}"
         yield "'eapctl apply' continues, 'eapctl rollback' restores the previous state"
 
 

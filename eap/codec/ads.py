@@ -189,6 +189,27 @@ class IndexGroup(IntEnum):
     CONTROL = 0x4541_5002
     """Own format: ReadWrite of a request of the control protocol that only reads, see
     ``ControlOffset``."""
+    CONFIGURE = 0x4541_5003
+    """Own format: ReadWrite of a request of the control protocol that shows or changes the
+    configuration of a station, see ``ConfigureOffset``."""
+
+
+class ConfigureOffset(IntEnum):
+    """Index offset in the group CONFIGURE: method of the control protocol."""
+
+    EXPORT = 0
+    PLAN = 1
+    ROUTING_EXPORT = 2
+    ROUTING_PLAN = 3
+    APPLY = 4
+    ROLLBACK = 5
+    ROUTING_APPLY = 6
+    ROUTING_ROLLBACK = 7
+
+    @property
+    def is_change(self) -> bool:
+        """True if the method changes something; the others show or compare."""
+        return self >= ConfigureOffset.APPLY
 
 
 class AdsRange(WireStruct, frozen=True):

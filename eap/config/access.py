@@ -54,7 +54,7 @@ def access_rules(index: Index, station: StationSection, shared: set[str]) -> Ite
             targets=tuple(
                 target for text in access.to for target in parse_target(index, text, shared)
             ),
-            services=parse_services(access.allow or access.deny),
+            services=parse_services(access.allow or access.deny, allows=bool(access.allow)),
             objects=tuple(parse_objects(text) for text in access.objects),
         )
 
@@ -64,15 +64,21 @@ def rule_name(access: AccessSection, number: int) -> str:
     return access.name or str(number + 1)
 
 
-def parse_services(texts: tuple[str, ...]) -> tuple[AccessService, ...]:
-    """Return the services of a rule, none for all; ``write`` is every service but reading."""
+def parse_services(texts: tuple[str, ...], *, allows: bool) -> tuple[AccessService, ...]:
+    """Return the services of a rule, none for all; ``write`` is every service but reading.
+
+    A rule that *allows* writing does not allow to configure, which changes the rules, too.
+    """
     found: list[AccessService] = []
     for text in texts:
         if text == ALL:
             return ()
         if text not in SERVICES:
             raise SectionError("", f"unknown access {text!r}{suggest(text, SERVICES)}", _SERVICES)
-        found += _WRITES if text == AccessService.WRITE else [AccessService(text)]
+        if text == AccessService.WRITE:
+            found += [each for each in _WRITES if each is not AccessService.CONFIGURE or not allows]
+        else:
+            found.append(AccessService(text))
     return tuple(dict.fromkeys(found))
 
 
@@ -232,7 +238,9 @@ def _check_rule(
         report.add(access.at, message, "allow or deny with what it is about, such as allow: [read]")
         is_fine = False
     key = "allow" if access.allow else "deny"
-    try_all(key, access.allow or access.deny, lambda text: parse_services((text,)))
+    allows = bool(access.allow)
+    texts = access.allow or access.deny
+    try_all(key, texts, lambda text: parse_services((text,), allows=allows))
     try_all("from", access.networks, parse_sender)
     try_all("net_ids", access.net_ids, lambda text: parse_source(index, text, shared))
     try_all("to", access.to, lambda text: parse_target(index, text, shared))

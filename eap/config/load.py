@@ -522,10 +522,14 @@ class PlantResult(msgspec.Struct, frozen=True):
     """Types that a valid plant defines."""
 
 
-def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
+def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> PlantResult:
     """Read, check and complete the plant file at *path*; never raises for the content of the file.
 
-    *describe_bus* reads the bus files that it names; their findings follow those of the plant.
+    Args:
+        path: The file.
+        describe_bus: Reads the bus files that it names; their findings follow those of the plant.
+        folder: Folder of the plant file where the plant runs, to which specifications refer; by
+            default that of *path*.
     """
     report = FindingReport(str(path))
     root = read(path, report)
@@ -552,10 +556,11 @@ def load(path: Path, describe_bus: DescribeBus) -> PlantResult:
     # Derived only from a plant without findings, so nothing below can fail.
     if findings := report.findings():
         return PlantResult(None, findings)
+    folder = path.parent if folder is None else folder
     plant = Plant(
         plant_file.plant,
-        derive(index, path.parent),
-        derive_routing(index, path.parent),
+        derive(index, folder),
+        derive_routing(index, folder),
         derive_directory(index),
         audit_required=plant_file.access.audit is AuditMode.REQUIRED,
         hosts=plant_file.hosts,

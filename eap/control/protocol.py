@@ -167,13 +167,29 @@ class Unsubscribed(Document, frozen=True):
 
 
 class Hello(Document, frozen=True, kw_only=True):
-    """Answer to ``hello``."""
+    """Answer to ``hello``; a field with a default is missing in answers of older releases.
+
+    Attributes:
+        version: Of the protocol.
+        release: Of the appliance.
+        plant: Name of its plant.
+        pid: Of its services.
+        stations: Those that run.
+        host: Host of the plant that it runs on; empty for a plant without ``hosts``.
+        plant_file: With which it was started; empty for a blank station.
+        audit_required: Whether changes that the audit cannot record are refused.
+        by_ads: Methods for clients by ADS.
+    """
 
     version: int
     release: str = ""
     plant: str
     pid: int = 0
     stations: list[str]
+    host: str = ""
+    plant_file: str = ""
+    audit_required: bool = False
+    by_ads: list[str] = []
 
 
 class VariableRow(Document, frozen=True):

@@ -7,6 +7,7 @@ by any ADS client, so that the access rules of the station apply to them, and it
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
 import time
 from collections.abc import AsyncGenerator
@@ -45,7 +46,14 @@ from eap.codec.amsdiscovery import (
     encode_discovery,
 )
 from eap.codec.structures import find_variable
-from eap.control.by_ads import PART, AnswerPart, ControlOffset, PartRequest
+from eap.control.by_ads import (
+    CONFIGURE_METHODS,
+    PART,
+    AnswerPart,
+    ControlOffset,
+    PartRequest,
+    pack,
+)
 from eap.control.protocol import (
     READ,
     VARIABLES,
@@ -67,6 +75,9 @@ CONNECT_S = 3.0
 """Time for a connection."""
 ANSWER_S = 5.0
 """Time for the answer of a router."""
+CONFIGURE_S = 60.0
+"""Time for a request about the configuration of a station."""
+_CONFIGURE_PAUSE_S = 0.1
 _DISCOVERY_TRIES = 3
 _DISCOVERY_S = 0.5
 _FIRST_PORT = 0x8000
@@ -136,13 +147,15 @@ class AdsConnection:
             async with asyncio.timeout(CONNECT_S):
                 reader, writer = await asyncio.open_connection(host, AMS_TCP_PORT)
         except (OSError, TimeoutError) as exc:
-            why = getattr(exc, "strerror", "") or "it does not answer"
+            # The text of asyncio repeats the address.
+            number = getattr(exc, "errno", None)
+            why = os.strerror(number) if number else "it does not answer"
             raise gone(f"{address.host} cannot be reached at port {AMS_TCP_PORT}: {why}") from None
         own = IPv4Address(writer.get_extra_info("sockname")[0])
         return cls(reader, writer, target, NetId(own.packed + b"\1\1"))
 
     async def request(self, method: str, params: dict[str, Any]) -> Any:
-        """Return the result of a method that reads, or of ``write``.
+        """Return the result of a method by ADS, or of ``write``.
 
         Raises:
             ControlError: the appliance or a router on the way refused or does not answer.
@@ -150,10 +163,20 @@ class AdsConnection:
         if method == "write":
             return await self._write(parameters(params, WriteParameters))
         line = encode_request(1, method, params).rstrip(b"\n")
-        answer, head = await self._part(ControlOffset.REQUEST, line)
+        configures = CONFIGURE_METHODS.get(method)
+        if configures is not None:
+            operation = ReadWrite(IndexGroup.CONFIGURE, configures, PART, pack(line))
+        else:
+            operation = ReadWrite(IndexGroup.CONTROL, ControlOffset.REQUEST, PART, line)
+        answer, head = await self._part(operation)
+        deadline_s = asyncio.get_running_loop().time() + CONFIGURE_S
+        while not head.total:
+            if asyncio.get_running_loop().time() > deadline_s:
+                raise gone(f"{method} is not done after {CONFIGURE_S:g} s")
+            await asyncio.sleep(_CONFIGURE_PAUSE_S)
+            answer, head = await self._rest(head.ticket, 0)
         while len(answer) < head.total:
-            wanted = PartRequest(head.ticket, len(answer)).encode()
-            more, head = await self._part(ControlOffset.PART, wanted)
+            more, head = await self._rest(head.ticket, len(answer))
             if not more:
                 raise gone("the appliance answered with less than it announced")
             answer += more
@@ -198,8 +221,11 @@ class AdsConnection:
         with suppress(OSError):
             await self._writer.wait_closed()
 
-    async def _part(self, offset: ControlOffset, data: bytes) -> tuple[bytes, AnswerPart]:
-        operation = ReadWrite(IndexGroup.CONTROL, offset, PART, data)
+    async def _rest(self, ticket: int, position: int) -> tuple[bytes, AnswerPart]:
+        wanted = PartRequest(ticket, position).encode()
+        return await self._part(ReadWrite(IndexGroup.CONTROL, ControlOffset.PART, PART, wanted))
+
+    async def _part(self, operation: ReadWrite) -> tuple[bytes, AnswerPart]:
         answer = await self._ask(self._target, CONTROL_PORT, operation)
         try:
             return answer[AnswerPart.SIZE :], AnswerPart.decode(answer)

@@ -9,13 +9,13 @@ Rule 3: a refusal by a station ends the change, unless ``keep_going`` is set.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self, TypeAlias
+from typing import Any, Protocol, Self, TypeAlias
 
 import msgspec
 
@@ -36,8 +36,9 @@ from eap.errors import ConfigError, ControlError
 from eap.ids import encode_value
 from eap.ops.client import ControlClient, connect_those
 from eap.pd.spec import StationSpec
+from eap.runtime.folder import ApplianceInfo
 from eap.runtime.plantfile import load_plant
-from eap.runtime.store import new_cause
+from eap.runtime.store import lean, new_cause
 from eap.suggest import suggest
 
 STATION_S = 60.0
@@ -67,6 +68,14 @@ class StationPlan(msgspec.Struct, frozen=True):
         return bool(self.changes or self.notes or self.refused)
 
 
+class AwayHost(msgspec.Struct, frozen=True):
+    """Host of a plant whose stations cannot be changed now, and why."""
+
+    host: str
+    stations: tuple[str, ...]
+    reason: str
+
+
 class StepOutcome(msgspec.Struct, frozen=True):
     """Result of one step."""
 
@@ -83,18 +92,26 @@ class PlannedStep(msgspec.Struct, frozen=True):
 
 
 class PlanReport(msgspec.Struct, frozen=True):
-    """``eapctl plan``; *absent* are stations of the plant that do not run here."""
+    """``eapctl plan``; *absent* are stations of a plant of one host that do not run here."""
 
     ok: bool
     stations: list[StationPlan]
     steps: list[PlannedStep]
     absent: tuple[str, ...]
+    away: tuple[AwayHost, ...] = ()
 
     @classmethod
-    def of(cls, plans: list[StationPlan], order: Iterable[Step], absent: tuple[str, ...]) -> Self:
+    def of(
+        cls,
+        plans: list[StationPlan],
+        order: Iterable[Step],
+        absent: tuple[str, ...],
+        away: tuple[AwayHost, ...] = (),
+    ) -> Self:
         """Return the report of *plans* and the steps in *order*."""
         steps = [PlannedStep(step.station, step.why) for step in order]
-        return cls(not any(each.refused for each in plans), plans, steps, absent)
+        is_ok = not (away or any(each.refused for each in plans))
+        return cls(is_ok, plans, steps, absent, away)
 
 
 class TakenStep(msgspec.Struct, frozen=True):
@@ -115,12 +132,23 @@ class RefusingStation(msgspec.Struct, frozen=True):
 
 
 class ChangeReport(msgspec.Struct, frozen=True):
-    """``eapctl apply`` and ``rollback``; *error* is the reason of an interruption."""
+    """``eapctl apply`` and ``rollback``.
+
+    Attributes:
+        ok: Whether all is done.
+        steps: Steps that were tried.
+        refused: Stations that cannot change while they run.
+        error: Reason of an interruption.
+        away: Hosts that could not be reached.
+        undone: Steps that took a failed change of several hosts back.
+    """
 
     ok: bool
     steps: list[TakenStep]
     refused: list[RefusingStation]
     error: str | None
+    away: tuple[AwayHost, ...] = ()
+    undone: list[TakenStep] = []
 
     @classmethod
     def of(
@@ -128,21 +156,39 @@ class ChangeReport(msgspec.Struct, frozen=True):
         taken: Iterable[StepOutcome],
         refusing: Mapping[str, list[str]],
         error: ControlError | None,
+        away: tuple[AwayHost, ...] = (),
+        undone: Iterable[StepOutcome] = (),
     ) -> Self:
         """Return the report of all steps *taken*."""
-        steps = [
-            TakenStep(
-                each.station,
-                each.why,
-                each.outcome.ok,
-                each.outcome.results,
-                each.outcome.refused,
-            )
-            for each in taken
-        ]
-        is_ok = not (refusing or error) and all(step.ok for step in steps)
+        steps = _taken(taken)
+        is_ok = not (refusing or error or away) and all(step.ok for step in steps)
         refused = [RefusingStation(name, why) for name, why in refusing.items()]
-        return cls(is_ok, steps, refused, None if error is None else str(error))
+        reason = None if error is None else str(error)
+        return cls(is_ok, steps, refused, reason, away, _taken(undone))
+
+
+def _taken(outcomes: Iterable[StepOutcome]) -> list[TakenStep]:
+    return [
+        TakenStep(
+            each.station,
+            each.why,
+            each.outcome.ok,
+            each.outcome.results,
+            each.outcome.refused,
+        )
+        for each in outcomes
+    ]
+
+
+class ApplianceClient(Protocol):
+    """Client of one appliance, of this host or of another one."""
+
+    info: ApplianceInfo
+
+    def call(
+        self, method: Method[ParametersT, AnswerT], /, *, within_s: float, **params: Any
+    ) -> AnswerT:
+        """Return the answer to *method*; raise ControlError if it is refused or does not come."""
 
 
 class PlantLink:
@@ -154,9 +200,13 @@ class PlantLink:
         absent: Its stations that do not run here.
         routing: Configuration of their routers in it.
         audit_required: Changes that the audit cannot record are refused.
+        remote: Stations of other hosts, whose plant file is another one.
+        away: Hosts that cannot be reached.
 
     Attributes:
         file: The plant file, as it was named.
+        absent: As given.
+        away: As given.
 
     Raises:
         ControlError: (every method) the appliance refused, or does not answer.
@@ -164,14 +214,18 @@ class PlantLink:
 
     def __init__(
         self,
-        clients: Mapping[str, ControlClient],
+        clients: Mapping[str, ApplianceClient],
         file: Path,
         absent: tuple[str, ...] = (),
         routing: Mapping[str, RoutingSpec] = MappingProxyType({}),
         *,
         audit_required: bool = False,
+        remote: Collection[str] = (),
+        away: tuple[AwayHost, ...] = (),
     ) -> None:
         self._clients = clients
+        self._remote = remote
+        self.away = away
         self._routing = routing
         self._audit_required = audit_required
         self.file = file
@@ -180,8 +234,40 @@ class PlantLink:
 
     @property
     def stations(self) -> tuple[str, ...]:
-        """Those that run here."""
+        """Those that run here, or on other hosts that are reached."""
         return tuple(self._clients)
+
+    @property
+    def hosts(self) -> dict[str, str]:
+        """Host of each station; none for a plant of one host."""
+        return {
+            name: client.info.host for name, client in self._clients.items() if client.info.host
+        }
+
+    def reached(self) -> PlantLink:
+        """Return the link to the stations that answer now; the hosts of the others are away."""
+        found: dict[str, ApplianceClient] = {}
+        away: dict[str, AwayHost] = {}
+        for name, client in self._clients.items():
+            try:
+                self.export(name)
+            except ControlError as exc:
+                if exc.code != ErrorCode.UNAVAILABLE:
+                    raise
+                host = client.info.host
+                before = away[host].stations if host in away else ()
+                away[host] = AwayHost(host, (*before, name), str(exc))
+            else:
+                found[name] = client
+        return PlantLink(
+            found,
+            self.file,
+            self.absent,
+            self._routing,
+            audit_required=self._audit_required,
+            remote=self._remote,
+            away=(*self.away, *away.values()),
+        )
 
     def export(self, station: str) -> RunningSpec:
         """Return the specification that a station runs."""
@@ -189,9 +275,7 @@ class PlantLink:
 
     def plan(self, spec: StationSpec) -> StationPlan:
         """Return the difference between *spec* and the station of its name."""
-        answer = self._call(
-            protocol.PLAN, spec.name, spec=msgspec.to_builtins(spec, enc_hook=encode_value)
-        )
+        answer = self._call(protocol.PLAN, spec.name, spec=_to_json(spec))
         router = self.plan_routing(spec.name)
         notes, refused = answer.station + router.changes, answer.refused + router.refused
         # Fixed when an appliance starts, so that applying a file cannot switch it off.
@@ -202,19 +286,18 @@ class PlantLink:
 
     def apply(self, spec: StationSpec, cause: str) -> ApplyAnswer:
         """Configure the station of its name by *spec*, as a step of the change named *cause*."""
-        where = {"cause": cause, "file": self._file}
+        # A remote appliance keeps the change as one that its own plant file does not have yet.
+        where = {"cause": cause, "file": "" if spec.name in self._remote else self._file}
         return self._call(
             protocol.APPLY,
             spec.name,
-            spec=msgspec.to_builtins(spec, enc_hook=encode_value),
+            spec=_to_json(spec),
             **where,
         )
 
     def rollback(self, spec: StationSpec) -> ApplyAnswer:
         """Configure the station of its name by *spec*, which is without alternates."""
-        return self._call(
-            protocol.ROLLBACK, spec.name, spec=msgspec.to_builtins(spec, enc_hook=encode_value)
-        )
+        return self._call(protocol.ROLLBACK, spec.name, spec=_to_json(spec))
 
     def export_routing(self, station: str) -> RunningRouting | None:
         """Return the configuration of a router; None if the plant file has none of it."""
@@ -226,12 +309,12 @@ class PlantLink:
         """Return the changes that the plant file makes at a router."""
         if station not in self._routing:
             return RoutingDifference(changes=[], refused=[])
-        routing = msgspec.to_builtins(self._routing[station])
+        routing = _to_json(self._routing[station])
         return self._call(protocol.ROUTING_PLAN, station, routing=routing)
 
     def apply_routing(self, station: str, cause: str) -> RoutingDifference:
         """Configure a router by the plant file, as a step of the change named *cause*."""
-        routing = msgspec.to_builtins(self._routing[station])
+        routing = _to_json(self._routing[station])
         return self._call(protocol.ROUTING_APPLY, station, routing=routing, cause=cause)
 
     def rollback_routing(self, station: str) -> RoutingDifference:
@@ -243,6 +326,11 @@ class PlantLink:
         return client.call(method, within_s=STATION_S, station=station, **params)
 
 
+def _to_json(spec: StationSpec | RoutingSpec) -> Any:
+    # Without defaults: an appliance of an earlier release does not know the newest fields.
+    return msgspec.to_builtins(lean(spec), enc_hook=encode_value)
+
+
 @contextmanager
 def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
     """Connect to the appliances that run stations of *plant*, for the length of a block.
@@ -252,15 +340,8 @@ def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
     Raises:
         ControlError: none of its stations runs here.
     """
-    names = {station.name for station in plant.stations}
-    clients = connect_those(
-        lambda info: (
-            # A blank appliance has no plant file, and the plant that it reports is its own name.
-            info.plant == plant.name if info.plant_file else not names.isdisjoint(info.stations)
-        )
-    )
-    try:
-        found = {name: each for each in clients for name in each.info.stations if name in names}
+    with ExitStack() as stack:
+        found = connect_local(plant, stack)
         if not found:
             command = shlex.join(["eapctl", "run", str(file)])
             raise ControlError(
@@ -271,9 +352,25 @@ def link_to(plant: Plant, file: Path) -> Iterator[PlantLink]:
         here = {name: found[name] for name in order if name in found}
         absent = tuple(name for name in order if name not in found)
         yield PlantLink(here, file, absent, plant.routing, audit_required=plant.audit_required)
-    finally:
-        for client in clients:
-            client.close()
+
+
+def connect_local(plant: Plant, stack: ExitStack) -> dict[str, ControlClient]:
+    """Return the appliances of this host by the stations of *plant* that they run.
+
+    Args:
+        plant: The plant.
+        stack: Closes the connections.
+    """
+    names = {station.name for station in plant.stations}
+    clients = connect_those(
+        lambda info: (
+            # A blank appliance has no plant file, and the plant that it reports is its own name.
+            info.plant == plant.name if info.plant_file else not names.isdisjoint(info.stations)
+        )
+    )
+    for client in clients:
+        stack.enter_context(client)
+    return {name: each for each in clients for name in each.info.stations if name in names}
 
 
 def load_or_raise(file: Path) -> Plant:
@@ -295,6 +392,9 @@ def choose(plant: Plant, link: PlantLink, wanted: Sequence[str]) -> dict[str, St
     for name in wanted:
         if name not in known:
             raise ConfigError(f"plant {plant.name} has no station {name!r}{suggest(name, known)}")
+        for away in link.away:
+            if name in away.stations:
+                raise ConfigError(f"station {name} is on host {away.host}: {away.reason}")
         if name not in link.stations:
             running = ", ".join(link.stations)
             raise ConfigError(
@@ -330,16 +430,14 @@ def apply_steps(
     *,
     keep_going: bool = False,
     routed: Iterable[str] = (),
+    cause: str = "",
 ) -> Iterator[StepOutcome]:
     """Run the steps of *order* and yield the outcome of each; last the routers of *routed*.
 
-    A station that refused a step gets no other.  Steps that go on with a change that was broken off
-    belong to it, so that a rollback undoes both.
+    A station that refused a step gets no other.  *cause* names the change, by default as
+    :func:`cause_of_change` does.
     """
-    running = [link.export(name) for name in link.stations]
-    under_way = [each.cause for each in running if _is_under_way(each.spec)]
-    # Alternates show that an earlier change was interrupted: this one continues it.
-    cause = max(under_way, default="") or new_cause()
+    cause = cause or cause_of_change(link)
     refused = set()
     for done in _walk(order, partial(link.apply, cause=cause), keep_going=keep_going):
         yield done
@@ -353,13 +451,24 @@ def apply_steps(
         )
 
 
+def cause_of_change(link: PlantLink) -> str:
+    """Return the name of the next change of the stations of *link*.
+
+    Steps that go on with a change that was broken off belong to it, so that a rollback undoes both.
+    """
+    running = [link.export(name) for name in link.stations]
+    under_way = [each.cause for each in running if _is_under_way(each.spec)]
+    # Alternates show that an earlier change was interrupted: this one continues it.
+    return max(under_way, default="") or new_cause()
+
+
 def roll_back(
-    link: PlantLink, stations: Iterable[str], *, keep_going: bool = False
+    link: PlantLink, stations: Iterable[str], *, keep_going: bool = False, cause: str = ""
 ) -> Iterator[StepOutcome]:
     """Undo the last change of *stations*, and yield the outcome of each step.
 
     Those that it did not change are left alone.  If it was taken back everywhere, and nothing is
-    left to do, it is made again.
+    left to do, it is made again; not if *cause* names the change to undo.
     """
     running = {name: link.export(name) for name in link.stations}
     now = {name: each.spec for name, each in running.items()}
@@ -370,11 +479,14 @@ def roll_back(
     causes = [each.cause for each in known.values()] + [each.cause for each in routers.values()]
     # Causes are times with leading zeros, so the largest text is the latest change.
     last = max(causes, default="")
+    if cause and last != cause:
+        return iter(())  # it changed nothing yet
     part = {name: each for name, each in known.items() if each.cause == last}
     left = {n: each for n, each in part.items() if not each.undone and each.previous != goal[n]}
     routed = [name for name, each in routers.items() if each.cause == last]
     routed_left = [name for name in routed if not routers[name].undone]
-    if not (left or routed_left or any(_is_under_way(each.spec) for each in part.values())):
+    is_done = not (left or routed_left or any(_is_under_way(each.spec) for each in part.values()))
+    if is_done and not cause:
         # Nothing is left to undo: this rollback undoes the last one.
         left, routed_left = part, routed
     goal |= {name: each.previous for name, each in left.items() if each.previous is not None}

@@ -239,6 +239,8 @@ class Handover(InheritedRecord, frozen=True):
     """Names of everything in the plant, also of stations on other hosts."""
     audit_required: bool = False
     """True if changes that cannot be recorded fail."""
+    host: str = ""
+    """Host of the plant that this computer is; empty without ``hosts``."""
 
     def port(self, name: PortName) -> PortSpec:
         """Return the specification of one port."""

@@ -9,9 +9,12 @@ from eap.config.index import ExpectedBus
 from eap.config.load import PlantResult, load
 
 
-def load_plant(path: Path) -> PlantResult:
-    """Read, check and complete the plant file at *path* and the bus files that it names."""
-    return load(path, _describe)
+def load_plant(path: Path, folder: Path | None = None) -> PlantResult:
+    """Read, check and complete the plant file at *path* and the bus files that it names.
+
+    The files of the plant are in *folder* where it runs, by default in that of *path*.
+    """
+    return load(path, _describe, folder)
 
 
 def _describe(path: Path) -> ExpectedBus | tuple[PlantFinding, ...]:

@@ -271,7 +271,7 @@ def digest_of(spec: StationSpec | RoutingSpec) -> str:
 
     Fields that hold their defaults do not count: a release that adds one does not change it.
     """
-    return digest(msgspec.json.encode(_lean(spec), enc_hook=encode_value))
+    return digest(msgspec.json.encode(lean(spec), enc_hook=encode_value))
 
 
 def adopt_plant_file(
@@ -351,18 +351,21 @@ def _with_plant_file(stored: Stored, file: Stored) -> Stored:
     return replace(file, previous=previous)
 
 
-def _lean(value: Any) -> Any:
-    """Return *value* for JSON, records without the fields that hold their defaults."""
+def lean(value: Any) -> Any:
+    """Return *value* for JSON, records without the fields that hold their defaults.
+
+    A release that does not know such a field reads it all the same.
+    """
     if isinstance(value, msgspec.Struct):
         tag, defaults = _outline(type(value))
-        lean = {"kind": tag} if tag is not None else {}
+        fields = {"kind": tag} if tag is not None else {}
         for name, default in defaults:
             held = getattr(value, name)
             if held != default:
-                lean[name] = _lean(held)
-        return lean
+                fields[name] = lean(held)
+        return fields
     if isinstance(value, tuple):
-        return [_lean(each) for each in value]
+        return [lean(each) for each in value]
     return value
 
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from eap.ams.directory import Directory
 from eap.ams.spec import DirectoryPort, DirectoryStation, RoutingSpec
+from eap.control.by_ads import METHODS
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.net import realtime
@@ -283,7 +284,7 @@ class Services:
         sockets.on_change.append(transports.follow)
         brokers = self._brokers(devices)
         methods = self._methods(images, buses, devices, audit, sockets)
-        remote = RemoteControl(methods.call, devices.routers)
+        remote = RemoteControl(methods.call, devices.routers, record=audit.write_request)
         for name, router in devices.routers.items():
             router.add_service(router.net_id, ControlAds(name, remote))
         reachable = Buses(devices.specs, buses.clients, buses.segments)
@@ -386,7 +387,16 @@ class Services:
         engine = self._resources.enter_context(
             DropCounters(self._folder.discards("engine"), self._names)
         )
-        identity = {"release": RELEASE, "plant": self._handover.plant, "pid": os.getpid()}
+        handover = self._handover
+        identity = {
+            "release": RELEASE,
+            "plant": handover.plant,
+            "pid": os.getpid(),
+            "host": handover.host,
+            "plant_file": handover.plant_file,
+            "audit_required": handover.audit_required,
+            "by_ads": list(METHODS),
+        }
 
         async def status() -> dict[str, Any]:
             reports = await bus_reports(buses.clients, STATUS_TIMEOUT_S)

@@ -226,6 +226,7 @@ class Supervisor:
             routing=_own_routing(plant),
             directory=plant.directory,
             audit_required=plant.audit_required,
+            host=info.host,
         )
         self._extras |= _optional_processes(plant, folder, self._bytecode)
         self._sockets = sockets

@@ -1,4 +1,6 @@
-"""Control protocol by ADS: methods that only read, for clients on other hosts.
+"""Control protocol by ADS: methods for clients on other hosts.
+
+Most only read; those about the configuration of a station need the right CONFIGURE.
 
 Each station's router has the service; its access rules have admitted a request before it comes
 here.  An appliance has several stations: what concerns another one needs the permission of its
@@ -11,6 +13,7 @@ for seconds, within a number of bytes.
 
 from __future__ import annotations
 
+import asyncio
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Collection, Mapping
 from time import monotonic
@@ -23,12 +26,14 @@ from eap.ams.access import host_of
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import CONTROL_PORT, AmsAnswer, AmsCommand, AmsHeader
 from eap.control.by_ads import (
+    CONFIGURE_METHODS,
     KEPT_S,
     MAX_REQUEST,
     READ_METHODS,
     AnswerPart,
     ControlOffset,
     PartRequest,
+    unpack,
 )
 from eap.control.protocol import (
     ErrorCode,
@@ -39,13 +44,19 @@ from eap.control.protocol import (
     encode_result,
     request_id,
 )
-from eap.errors import CodecError, ControlError
+from eap.errors import CodecError, ControlError, EapError
 from eap.ids import Endpoint, NetId
 from eap.net.limits import Rate, SourceRateLimiter, SourceRates
 from eap.services.ads.ads_service import begin_answer
-from eap.services.control.control_server import failure_of
+from eap.services.control.control_server import (
+    RecordChange,
+    change_of,
+    error_in_result,
+    failure_of,
+)
 from eap.services.routing.service import LocalRequest
 from eap.services.routing.station_router import StationRouter
+from eap.services.tasks import TaskSet
 
 RATES = SourceRates(
     source=Rate(200, 100), known=Rate(600, 200), new=Rate(200, 50), local=Rate(600, 200)
@@ -56,6 +67,11 @@ STATUS_S = 0.1
 KEPT_BYTES = 32 << 20
 """Bytes of all answers that are kept for clients that fetch them in parts."""
 _MAX_HOSTS = 256
+_MAX_PENDING = 64
+"""Requests of the group CONFIGURE that are done at once."""
+AT_ONCE_S = 1.0
+"""Time within which a request of the group CONFIGURE has its answer at once."""
+_READ = ReadWrite(IndexGroup.CONTROL, ControlOffset.REQUEST, 0, b"")
 _TABLE = ("pd_list", "routes_list")
 """Methods whose answer is a list with rows of all stations, unless they are asked for one."""
 
@@ -88,6 +104,7 @@ class RemoteControl:
         call: Calls a method of the control protocol.
         routers: Of all stations.
         clock: In seconds.
+        record: Writes the outcome of a change into the audit.
     """
 
     def __init__(
@@ -95,10 +112,15 @@ class RemoteControl:
         call: Callable[[str, dict[str, Any]], Awaitable[Any]],
         routers: Mapping[str, StationRouter],
         clock: Callable[[], float] = monotonic,
+        record: RecordChange | None = None,
     ) -> None:
         self._call = call
         self._routers = routers
         self._clock = clock
+        self._record = record
+        self._tasks = TaskSet("configuration by ADS")
+        self._pending: dict[int, _RequestOrigin] = {}
+        """Clients of requests that are not done yet, by ticket."""
         self._rates = SourceRateLimiter(RATES, _MAX_HOSTS, clock())
         self._status: tuple[float, dict[str, Any]] | None = None
         self._kept: OrderedDict[int, _KeptAnswer] = OrderedDict()
@@ -129,9 +151,78 @@ class RemoteControl:
             answer = encode_failure(number, failure_of(exc))
         return self._first_part(client, answer.rstrip(b"\n"), length)
 
+    async def configure(
+        self, client: _RequestOrigin, station: str, operation: ReadWrite
+    ) -> OperationOutcome:
+        """Return the begin of the answer to a request of the group CONFIGURE.
+
+        The request is done to its end, whatever becomes of the client.  An answer that takes longer
+        than a moment is fetched like the rest of a long one.
+
+        Args:
+            client: Its client.
+            station: Station whose router admitted it.
+            operation: The request.
+        """
+        if len(self._pending) >= _MAX_PENDING:
+            return OperationOutcome(AdsError.BUSY, why="too many configurations at once")
+        self._last_ticket = ticket = self._last_ticket % 0xFFFF_FFFF + 1
+        self._pending[ticket] = client
+        done = self._tasks.start_awaited(self._configure(client, station, operation))
+
+        def finish(task: asyncio.Task[bytes]) -> None:
+            if self._pending.pop(ticket, None) and not task.cancelled():
+                self._keep(client, task.result(), ticket)
+
+        try:
+            await asyncio.wait({done}, timeout=AT_ONCE_S)
+        finally:  # its client may have gone meanwhile
+            if done.done():
+                del self._pending[ticket]
+            else:
+                done.add_done_callback(finish)
+        if not done.done():
+            return OperationOutcome(data=AnswerPart(ticket, 0).encode())
+        return OperationOutcome(data=self._first_part(client, done.result(), operation.length))
+
+    async def _configure(self, client: _RequestOrigin, station: str, operation: ReadWrite) -> bytes:
+        """Return the answer to a request, which the audit has by then."""
+        number = None
+        try:
+            request = decode_request(unpack(operation.data))
+            number = request.id
+            if CONFIGURE_METHODS.get(request.method) != operation.offset:
+                reason = f"{request.method!r} is no method of offset {operation.offset}"
+                raise ControlError(reason, code=ErrorCode.UNKNOWN_METHOD)  # noqa: TRY301
+            named = str(request.params.get("station"))
+            if named != station and named in self._routers:
+                self._require(client, named, operation)
+            return encode_result(number, await self._call_audited(client, request)).rstrip(b"\n")
+        except Exception as exc:  # noqa: BLE001  failure_of() logs a defect
+            return encode_failure(number, failure_of(exc)).rstrip(b"\n")
+
+    async def _call_audited(self, client: _RequestOrigin, request: Request) -> Any:
+        change = change_of(request, lambda _: None)
+        if change is None or self._record is None:
+            return await self._call(request.method, request.params)
+        station, fields = change
+        error: str | None = None  # as long as nobody knows
+        try:
+            result = await self._call(request.method, request.params)
+            error = error_in_result(result)
+        except EapError as exc:
+            error = str(exc)
+            raise
+        finally:
+            peer = f"{client.endpoint.transport} {host_of(client.endpoint)}, {client.source}"
+            self._record(peer, station, fields | {"error": error})
+        return result
+
     def part(self, client: _RequestOrigin, wanted: PartRequest, length: int) -> OperationOutcome:
         """Return the bytes of an answer that follow a part; the last one ends it."""
         self._drop_old()
+        if self._pending.get(wanted.ticket) == client:
+            return OperationOutcome(data=AnswerPart(wanted.ticket, 0).encode())
         kept = self._kept.get(wanted.ticket)
         if kept is None or kept.client != client:
             return OperationOutcome(AdsError.NOT_FOUND, why=f"no answer has ticket {wanted.ticket}")
@@ -167,10 +258,10 @@ class RemoteControl:
             self._status = now_s, await self._call("status", params)
         return self._status[1]
 
-    def _require(self, client: _RequestOrigin, station: str) -> None:
-        """Raise ControlError if the rules of another station deny the client to read it."""
+    def _require(self, client: _RequestOrigin, station: str, operation: ReadWrite = _READ) -> None:
+        """Raise ControlError if the rules of another station deny the client an operation."""
         router = self._routers[station]
-        header, body = _read_request(client, router.net_id)
+        header, body = _request_to(router.net_id, client, operation)
         if why := router.denial(header, body, client.endpoint):
             raise ControlError(f"station {station}: {why}", code=ErrorCode.REFUSED)
 
@@ -183,13 +274,16 @@ class RemoteControl:
         space = max(0, length - AnswerPart.SIZE)
         if len(line) <= space:
             return AnswerPart(0, len(line)).encode() + line
+        self._last_ticket = ticket = self._last_ticket % 0xFFFF_FFFF + 1
+        self._keep(client, line, ticket)
+        return AnswerPart(ticket, len(line)).encode() + line[:space]
+
+    def _keep(self, client: _RequestOrigin, line: bytes, ticket: int) -> None:
         self._drop_old()
-        self._last_ticket = self._last_ticket % 0xFFFF_FFFF + 1
-        self._kept[self._last_ticket] = _KeptAnswer(client, line, self._clock() + KEPT_S)
+        self._kept[ticket] = _KeptAnswer(client, line, self._clock() + KEPT_S)
         self._kept_bytes += len(line)
         while self._kept_bytes > KEPT_BYTES:
             self._drop(next(iter(self._kept)))
-        return AnswerPart(self._last_ticket, len(line)).encode() + line[:space]
 
     def _drop_old(self) -> None:
         now_s = self._clock()
@@ -224,6 +318,8 @@ class ControlAds:
         client = _RequestOrigin(request.endpoint, header.source, header.source_port)
 
         def perform(operation: object) -> OperationOutcome | Awaitable[OperationOutcome]:
+            if isinstance(operation, ReadWrite) and operation.group == IndexGroup.CONFIGURE:
+                return self._control.configure(client, self._station, operation)
             if not isinstance(operation, ReadWrite) or operation.group != IndexGroup.CONTROL:
                 return OperationOutcome(AdsError.INDEX_GROUP)
             if operation.offset == ControlOffset.REQUEST:
@@ -246,11 +342,10 @@ class ControlAds:
         return OperationOutcome(data=answer)
 
 
-_READ = ReadWrite(IndexGroup.CONTROL, ControlOffset.REQUEST, 0, b"")
-
-
-def _read_request(client: _RequestOrigin, target: NetId) -> tuple[AmsHeader, bytes]:
-    command, body = encode_query(_READ)
+def _request_to(
+    target: NetId, client: _RequestOrigin, operation: ReadWrite
+) -> tuple[AmsHeader, bytes]:
+    command, body = encode_query(operation)
     header = AmsHeader(target, CONTROL_PORT, client.source, client.source_port, AmsCommand(command))
     return header, body
 

@@ -30,7 +30,7 @@ def test_a_rule_says_what_its_texts_stand_for(index):
         " {name: rest, allow: [all]}]"
     )
     plant = index((LEFT_PORT, f"{LEFT_PORT}\n    {access}"))
-    writes = AccessService.WRITE, AccessService.CONTROL, AccessService.FILES, AccessService.RAW
+    writes = tuple(each for each in AccessService if each is not AccessService.READ)
     assert list(access_rules(plant, plant.stations["left"], set())) == [
         AccessRule(
             "1",
@@ -48,10 +48,13 @@ def test_a_rule_says_what_its_texts_stand_for(index):
 
 
 def test_write_is_every_service_but_read():
-    assert AccessService.READ not in parse_services(("write",))
-    assert parse_services(("read", "files", "read")) == (AccessService.READ, AccessService.FILES)
-    assert len(parse_services(("read", "write"))) == len(AccessService)
-    assert parse_services(("read", "all")) == ()
+    assert AccessService.READ not in parse_services(("write",), allows=True)
+    assert parse_services(("read", "files", "read"), allows=True) == (
+        AccessService.READ,
+        AccessService.FILES,
+    )
+    assert len(parse_services(("read", "write"), allows=False)) == len(AccessService)
+    assert parse_services(("read", "all"), allows=True) == ()
 
 
 @pytest.mark.parametrize(
@@ -147,9 +150,15 @@ def test_a_sender_is_a_network_or_a_mac_address():
         parse_sender("10.0.0.0/33")
 
 
+def test_right_to_write_is_none_to_configure_and_no_right_to_write_neither():
+    assert AccessService.CONFIGURE not in parse_services(("write",), allows=True)
+    assert AccessService.CONFIGURE in parse_services(("write",), allows=False)
+    assert parse_services(("configure",), allows=True) == (AccessService.CONFIGURE,)
+
+
 def test_unknown_access_is_refused():
     with pytest.raises(SectionError, match=r"unknown access 'wirte', did you mean write\?"):
-        parse_services(("wirte",))
+        parse_services(("wirte",), allows=True)
 
 
 PORT = '"udp://127.0.9.1", net_id: 127.0.9.1.2.1}'

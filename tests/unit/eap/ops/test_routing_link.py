@@ -2,8 +2,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
-
 from eap.ams.spec import AccessRule, RoutingSpec
 from eap.control.device import RoutingDifference, RunningRouting
 from eap.ops.plant import PlantLink
@@ -25,7 +23,7 @@ def link_to(client: FakeClient, routing: dict[str, RoutingSpec]) -> PlantLink:
 def test_plant_link_routing_of_plant_file_asks_the_station():
     client = FakeClient()
     link = link_to(client, {"left": TOLD})
-    told = msgspec.to_builtins(TOLD)
+    told = {"access": [{"name": "a"}]}  # fields with their defaults are left out
     assert link.export_routing("left") == RunningRouting(routing=RoutingSpec())
     assert link.plan_routing("left") == RoutingDifference(**DIFFERENCE)
     applied, taken_back = link.apply_routing("left", "1"), link.rollback_routing("left")

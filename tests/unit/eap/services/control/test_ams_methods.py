@@ -43,7 +43,8 @@ def test_trace_of_a_local_target() -> None:
     assert (found["ok"], found["why"]) == (True, "")
     (hop,) = found["hops"]
     assert (hop["station"], hop["net_id"], hop["opaque"]) == ("island-01", str(NET_ID), False)
-    assert hop["may"] == dict.fromkeys(("read", "write", "control", "files", "raw"), True)
+    services = ("read", "write", "control", "files", "raw", "configure")
+    assert hop["may"] == dict.fromkeys(services, True)
     assert hop["took_us"] == hop["spent_us"]
     answer = found["answer"]
     assert (answer["error"], answer["text"], answer["ads_state"]) == (0, "", 5)

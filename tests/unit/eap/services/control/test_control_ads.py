@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import random
 import struct
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -16,11 +18,22 @@ from eap.ams.access import AccessList
 from eap.ams.spec import AccessRule, AccessService
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import CONTROL_PORT, AmsAnswer, AmsHeader
-from eap.control.by_ads import KEPT_S, ControlOffset
+from eap.control.by_ads import CONFIGURE_METHODS, KEPT_S, MAX_PACKED, ControlOffset, pack, unpack
+from eap.control.device import ApplyAnswer
+from eap.control.protocol import MAX_LINE
+from eap.errors import ControlError
 from eap.ids import Endpoint, NetId
-from eap.services.control.control_ads import KEPT_BYTES, RATES, STATUS_S, ControlAds, RemoteControl
+from eap.services.control.control_ads import (
+    AT_ONCE_S,
+    KEPT_BYTES,
+    RATES,
+    STATUS_S,
+    ControlAds,
+    RemoteControl,
+)
 from eap.services.routing.service import LocalRequest
 from eap.services.routing.station_router import StationRouter
+from tests.support.virtualtime import run_virtual
 
 NEAR, FAR = NetId.parse("5.1.1.1.1.1"), NetId.parse("5.2.2.2.1.1")
 STATIONS = {"near": NEAR, "far": FAR}
@@ -45,7 +58,12 @@ class Appliance:
             )
             for name, net_id in STATIONS.items()
         }
-        self.control = RemoteControl(self._call, self.routers, lambda: self.now_s)
+        self.audit: list[tuple[str, str, dict[str, Any]]] = []
+        self.slow = asyncio.Event()
+        self.slow.set()
+        self.control = RemoteControl(
+            self._call, self.routers, lambda: self.now_s, lambda *line: self.audit.append(line)
+        )
         self.service = ControlAds("near", self.control)
 
     async def _call(self, method: str, params: dict[str, Any]) -> Any:
@@ -54,6 +72,10 @@ class Appliance:
             stations = [{"name": name} for name in STATIONS]
             wheres = ["near/eap0", "far", "far/eap0", "far ← pd", "farther"]
             return {"stations": stations, "findings": [{"where": each} for each in wheres]}
+        if method in CONFIGURE_METHODS:
+            await self.slow.wait()
+        if isinstance(self.values, Exception):
+            raise self.values
         if method == "pd_list":
             return [{"station": params["station"]}]
         return self.values
@@ -66,18 +88,28 @@ class Appliance:
         *,
         host: str = "10.0.0.9",
         port: int = 1,
+        group: int = IndexGroup.CONTROL,
     ) -> tuple[int, bytes]:
         """Return result and data of the answer to a request from a host."""
-        command, body = encode_query(ReadWrite(IndexGroup.CONTROL, offset, length, data))
+        return asyncio.run(self.ask_soon(offset, data, length, host=host, port=port, group=group))
+
+    async def ask_soon(
+        self,
+        offset: int,
+        data: bytes,
+        length: int = 60_000,
+        *,
+        host: str = "10.0.0.9",
+        port: int = 1,
+        group: int = IndexGroup.CONTROL,
+    ) -> tuple[int, bytes]:
+        """Return result and data of the answer to a request from a host."""
+        command, body = encode_query(ReadWrite(group, offset, length, data))
         source = NetId.parse("10.0.0.9.1.1")
         header = AmsHeader(NEAR, CONTROL_PORT, source, port, command)
         endpoint = Endpoint("ams-tcp", f"{host}:4000#1")
-
-        async def answer() -> AmsAnswer:
-            found = self.service.answer(LocalRequest(header, body, endpoint))
-            return found if isinstance(found, AmsAnswer) else await found
-
-        found = asyncio.run(answer())
+        answer = self.service.answer(LocalRequest(header, body, endpoint))
+        found = answer if isinstance(answer, AmsAnswer) else await answer
         outcome = decode_outcome(command, found.error_code, found.data)
         return outcome.result, outcome.data
 
@@ -186,3 +218,113 @@ def test_any_request_is_answered_with_a_line_of_the_protocol(line: bytes) -> Non
     result, data = Appliance().ask(ControlOffset.REQUEST, line)
     assert result == 0
     assert json.loads(data[8:])["v"] == 1
+
+
+def packed(method: str, **params: Any) -> bytes:
+    return pack(json.dumps({"v": 1, "id": 4, "method": method, "params": params}).encode())
+
+
+def configure(appliance: Appliance, method: str, **params: Any) -> dict[str, Any]:
+    """Return the answer to a request of the group CONFIGURE that has one part."""
+    offset = CONFIGURE_METHODS[method]
+    data = packed(method, **params)
+    result, answer = appliance.ask(offset, data, group=IndexGroup.CONFIGURE)
+    assert (result, answer[:4]) == (0, bytes(4))
+    document: dict[str, Any] = json.loads(answer[8:])
+    return document
+
+
+def test_change_is_made_and_its_outcome_is_in_the_audit() -> None:
+    appliance = Appliance()
+    appliance.values = ApplyAnswer(ok=False, results=[], station=[], refused=["disk full"])
+    answer = configure(appliance, "apply", station="near", spec={"name": "near"}, cause="7")
+    assert answer["result"]["refused"] == ["disk full"]
+    fields = {"operation": "apply", "asked": {"cause": "7"}, "error": "disk full"}
+    assert appliance.audit == [("ams-tcp 10.0.0.9, 10.0.0.9.1.1", "near", fields)]
+
+
+def test_change_that_fails_is_an_answer_and_in_the_audit() -> None:
+    appliance = Appliance()
+    appliance.values = ControlError("no engine", code="unavailable")
+    answer = configure(appliance, "rollback", station="near")
+    assert answer["error"] == {"code": "unavailable", "message": "no engine"}
+    assert [line[2]["error"] for line in appliance.audit] == ["no engine"]
+
+
+def test_plan_and_export_are_not_audited() -> None:
+    appliance = Appliance()
+    for method in ("plan", "export", "routing_plan", "routing_export"):
+        configure(appliance, method, station="near")
+    assert appliance.audit == []
+
+
+def test_rules_of_another_station_decide_on_its_configuration() -> None:
+    appliance = Appliance()  # other hosts only read where no rule says more
+    refused = configure(appliance, "apply", station="far")["error"]
+    assert (refused["code"], appliance.calls) == ("refused", [])
+    assert "station far: " in refused["message"]
+    rule = AccessRule(name="engineers", allow=True, services=(AccessService.CONFIGURE,))
+    permitted = Appliance(far=rule)
+    assert configure(permitted, "apply", station="far")["result"] == {}
+
+
+@pytest.mark.parametrize(
+    ("offset", "data", "reason"),
+    [
+        (CONFIGURE_METHODS["plan"], packed("apply", station="near"), "is no method of offset 1"),
+        (CONFIGURE_METHODS["plan"], packed("stop"), "'stop' is no method of offset 1"),
+        (99, packed("apply", station="near"), "'apply' is no method of offset 99"),
+        (CONFIGURE_METHODS["plan"], b"{}", "not compressed: "),
+        (CONFIGURE_METHODS["plan"], packed("plan")[:-3], "a request has at most "),
+        (CONFIGURE_METHODS["plan"], pack(bytes(MAX_LINE + 1)), "a request has at most "),
+    ],
+)
+def test_request_that_is_none_about_a_configuration_is_refused(
+    offset: int, data: bytes, reason: str
+) -> None:
+    appliance = Appliance()
+    result, answer = appliance.ask(offset, data, group=IndexGroup.CONFIGURE)
+    assert result == 0
+    assert reason in json.loads(answer[8:])["error"]["message"]
+    assert appliance.calls == []
+
+
+def test_request_that_cannot_be_packed_is_an_error() -> None:
+    with pytest.raises(ControlError, match=f"has at most {MAX_PACKED} bytes, not "):
+        pack(random.Random(1).randbytes(MAX_PACKED + 100))
+
+
+@given(st.binary(max_size=300))
+def test_any_line_is_packed_and_unpacked(line: bytes) -> None:
+    assert unpack(pack(line)) == line
+
+
+@given(st.binary(max_size=300))
+def test_any_data_is_unpacked_or_refused(data: bytes) -> None:
+    with suppress(ControlError):
+        assert len(unpack(data)) <= MAX_LINE
+
+
+def test_answer_that_takes_long_is_fetched_by_its_ticket() -> None:
+    appliance = Appliance()
+
+    async def run() -> None:
+        appliance.slow.clear()
+        data = packed("apply", station="near")
+        offset = CONFIGURE_METHODS["apply"]
+        result, answer = await appliance.ask_soon(offset, data, group=IndexGroup.CONFIGURE)
+        ticket, total = struct.unpack("<II", answer)
+        assert (result, total) == (0, 0)
+        assert ticket
+        wanted = struct.pack("<II", ticket, 0)
+        # Not there yet, and never for another client.
+        assert await appliance.ask_soon(ControlOffset.PART, wanted) == (0, answer)
+        other, _ = await appliance.ask_soon(ControlOffset.PART, wanted, port=2)
+        assert other == AdsError.NOT_FOUND
+        appliance.slow.set()
+        await asyncio.sleep(AT_ONCE_S)
+        found = await appliance.ask_soon(ControlOffset.PART, wanted)
+        assert json.loads(found[1][8:])["result"] == {}
+        assert [line[1] for line in appliance.audit] == ["near"]
+
+    run_virtual(run())

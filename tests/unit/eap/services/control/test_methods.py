@@ -55,6 +55,10 @@ def test_hello_status_and_stop(methods, stopped):
         "release": "0",
         "pid": 0,
         "stations": ["left", "right"],
+        "host": "",
+        "plant_file": "",
+        "audit_required": False,
+        "by_ads": [],
     }
     assert call(methods, "status", {}) == {"version": 1}
     assert call(methods, "stop", {}) == {"stopping": True}
