@@ -129,7 +129,6 @@ def default_pages(plant: str, stations: Iterable[str]) -> tuple[WebPage, ...]:
             name=name,
             panels=(
                 GraphPanel(of=name),
-                StatesPanel(of=f"{name}/{STATE}"),
                 TablePanel(of=f"{name}/*"),
                 BusPanel(of=f"{name}/*"),
                 RoutesPanel(of=name),

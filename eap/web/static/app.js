@@ -131,6 +131,7 @@ class App {
   #showPlant({ plant, findings, unreachable, time }) {
     setText(byId("plant"), plant || this.session.plant || "EAP");
     setText(byId("clock"), formatTime(time));
+    setAttribute(byId("clock"), "data-date", new Date(time * 1000).toLocaleDateString(language)); // on paper
     const count = (severity) => findings.filter((each) => each.severity === severity).length;
     const [errors, warnings] = [count("error"), count("warning")];
     const text = [errors && `■ ${t("errors")} ${errors}`, warnings && `▲ ${t("warnings")} ${warnings}`].filter(Boolean).join("  ");
@@ -186,11 +187,11 @@ class App {
     const item = (href, text) => h("li", {}, h("a", { href }, text));
     const names = this.pages.map((page) => page.name);
     const hasPlant = this.pages.some((page) => page.panels.some((panel) => panel.kind === "plant" && panel.of === "*"));
-    const rest = this.stations.filter((name) => !names.includes(name));
+    const own = names.filter((name) => !this.stations.includes(name)); // a page with a station's name is that station's
     const list = (heading, items) => (items.length ? [h("h2", {}, heading), h("ul", {}, items)] : []);
     const parts = this.session?.role ? [
-      ...list(t("pages"), [...names.map((name) => item(hrefOf("page", name), name)), ...(hasPlant ? [] : [item("#/plant/", t("plant"))]), item("#/events/", t("events"))]),
-      ...list(t("stations"), rest.map((name) => item(hrefOf("station", name), name)))] : [];
+      ...list(t("pages"), [...own.map((name) => item(hrefOf("page", name), name)), ...(hasPlant ? [] : [item("#/plant/", t("plant"))]), item("#/events/", t("events"))]),
+      ...list(t("stations"), this.stations.map((name) => item(hrefOf(names.includes(name) ? "page" : "station", name), name)))] : [];
     byId("nav").replaceChildren(...parts);
     setAttribute(byId("nav"), "aria-label", t("navigation"));
   }

@@ -18,7 +18,7 @@ export function graphPanel(panel, scope) {
   const svg = s("svg", { class: "graph", role: "group", "aria-label": t("graph") });
   const frame = h("div", { class: "graph-frame" }, svg);
   const flows = table(t("process_data"), [t("from"), t("pd"), t("to"), t("subscription"), t("state"),
-    { text: t("rate"), number: true }, { text: t("age"), number: true }, { text: t("lost"), number: true }, { text: t("late"), number: true }, { text: t("jitter"), number: true }]);
+    { text: t("rate"), number: true }, { text: t("age"), number: true }, { text: t("lost"), number: true }, { text: t("late"), number: true }, { text: t("jitter"), number: true }], { class: "flows" });
   const details = h("details", {}, h("summary", {}, t("process_data")), flows.frame);
   const rows = new Rows(flows.body);
   const losses = new Losses();
@@ -127,7 +127,8 @@ function draw(svg, names, links, width, shape) {
     arrow.first = s("tspan", { x, dy: "-0.1em" });
     arrow.second = s("tspan", { x, dy: "1.15em" });
     arrow.label = s("text", { class: "label", x, y }, arrow.first, arrow.second);
-    arrow.group = s("g", { class: "link" }, arrow.title, s("path", { d: path, class: "reach" }), arrow.path, arrow.label);
+    arrow.plate = s("rect", { class: "plate", rx: "3" });
+    arrow.group = s("g", { class: "link" }, arrow.title, s("path", { d: path, class: "reach" }), arrow.path, arrow.plate, arrow.label);
     arrow.key = key;
     svg.append(arrow.group);
   }
@@ -143,6 +144,13 @@ function draw(svg, names, links, width, shape) {
     svg.append(group);
   }
   return { shape, arrows, nodes, hasRoom: width >= NARROW };
+}
+
+/** Lay the ground of a label under it, so that the arrow does not cross its text. */
+function fitPlate({ label, plate }) {
+  const { x, y, width, height } = label.getBBox();
+  if (!width) return;
+  for (const [name, value] of Object.entries({ x: x - 4, y: y - 1, width: width + 8, height: height + 2 })) setAttribute(plate, name, value.toFixed(1));
 }
 
 /** Return whether all slaves of a station are in OP, by the text of its buses. */
@@ -175,6 +183,7 @@ function update({ arrows, nodes, hasRoom }, message, links, losses) {
     const sign = { alarm: "■ ", warn: "▲ " }[severity] ?? "";
     setText(arrow.first, `${sign}${worst && worst.flow?.state !== "running" ? `${tn("pd_state", worst.flow?.state ?? "waiting")} ` : ""}${formatRate(sum("per_s"))} · ${formatDuration(age)}`);
     setText(arrow.second, t("arrow_lost", { lost: sum("lost"), late: sum("late") }));
+    fitPlate(arrow);
     setText(arrow.title, own.map((each) => `${each.pd || each.id} → ${each.subscription}: ${formatRate(each.flow?.per_s)}, ${t("lost")} ${each.flow?.lost ?? "–"}, ${t("late")} ${each.flow?.late ?? "–"}, ${t("age")} ${formatDuration(each.flow?.age_us)}`).join("\n"));
   }
 }

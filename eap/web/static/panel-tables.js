@@ -125,10 +125,11 @@ function slaveCells(slave) {
 /** Panel `routes`: AMS routes of stations, with their states. */
 export function routesPanel(panel, scope) {
   const { app } = scope;
-  const { frame, body } = table(t("routes"), [t("station"), t("route"), t("net_id"), t("via"), t("state"), { text: t("round_trip"), number: true }, { text: t("requests"), number: true }]);
+  const stations = app.stations.filter((each) => matchesAny(panel.of, each));
+  const first = stations.length > 1 ? 0 : 1; // of one station its name is in the heading
+  const { frame, body } = table(t("routes"), [t("station"), t("route"), t("net_id"), t("via"), t("state"), { text: t("round_trip"), number: true }, { text: t("requests"), number: true }].slice(first));
   const rows = new Rows(body);
   const note = h("p", { class: "note", role: "status" });
-  const stations = app.stations.filter((each) => matchesAny(panel.of, each));
   const routers = new Map();
   let isEnded = false;
   const load = async () => {
@@ -145,7 +146,7 @@ export function routesPanel(panel, scope) {
     }
     setText(note, failure ? `▲ ${failure}` : routers.size ? "" : t("no_routes"));
     const shown = [...routers.values()].flat().flatMap((router) => router.routes.map((route) => ({ station: router.station, ...route })));
-    rows.show(shown, (each) => `${each.station} ${each.net_id} ${each.transport} ${each.address}`, routeCells);
+    rows.show(shown, (each) => `${each.station} ${each.net_id} ${each.transport} ${each.address}`, (each) => routeCells(each).slice(first));
     frame.hidden = !shown.length;
     if (!shown.length && !failure) setText(note, t("no_routes"));
   };

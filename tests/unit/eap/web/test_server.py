@@ -523,7 +523,7 @@ def test_default_pages_are_one_of_the_plant_and_one_a_station():
         pages = (await (await client.get("/api/v1/pages")).json())["pages"]
         assert [each["name"] for each in pages] == ["line", "mixer"]
         kinds = [panel["kind"] for panel in pages[1]["panels"]]
-        assert kinds == ["plant", "states", "variables", "bus", "routes", "events"]
+        assert kinds == ["plant", "variables", "bus", "routes", "events"]
 
     play(script, WebSection())
 
