@@ -259,11 +259,16 @@ def _check_proxy(web: ServerSection, report: FindingReport) -> None:
     if not proxy.networks:
         report.add(f"{proxy.at}.from", "from is empty", "the address of the proxy")
     for position, text in enumerate(proxy.networks):
+        at = f"{proxy.at}.from[{position}]"
         try:
-            ip_network(text, strict=False)
+            network = ip_network(text, strict=False)
         except ValueError:
             message = f"{text!r} is no address and no network"
-            report.add(f"{proxy.at}.from[{position}]", message, "the address of the proxy")
+            report.add(at, message, "the address of the proxy")
+            continue
+        if not network.prefixlen:
+            message = f"{text}: every host could name itself any user"
+            report.add(at, message, "the address of the proxy")
     if not web.users:
         report.add(proxy.at, "a proxy without users", "users with their roles, without passwords")
 

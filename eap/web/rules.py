@@ -31,7 +31,7 @@ class SetRules:
         if any(map(user.may_act_as, roles)):
             return ""
         needed = min(roles, key=list(Role).index)
-        return f"{name} is set by {needed}s: you are a {user.role}"
+        return f"{name} is set by {needed}s: your role is {user.role}"
 
     def reason_refused(self, user: Principal, name: str, value: Any, comment: str) -> str:
         """Return the reason that a value breaks the rules of all panels, empty if it does not."""

@@ -4,6 +4,8 @@ import re
 import textwrap
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from eap.config.index import ExpectedBus
 from eap.config.load import PlantResult, load
@@ -157,6 +159,10 @@ def test_picture_with_a_script_is_a_warning(tmp_path):
             "'x' is no address and no network",
         ),
         ("{proxy: {header: X-User, from: []}, users: [{name: a}]}", "from is empty"),
+        (
+            "{proxy: {header: X-User, from: [0.0.0.0/0]}, users: [{name: a}]}",
+            "0.0.0.0/0: every host could name itself any user",
+        ),
         ("{proxy: {header: X-User}}", "a proxy without users"),
         ("{pages: [{name: ' ', panels: []}]}", "the page has an empty name"),
         ("{pages: [{name: A, panels: []}, {name: A, panels: []}]}", "page 'A' is there twice"),
@@ -229,6 +235,20 @@ def test_names_fit_patterns():
     assert match_names("*", names) == []
     assert match_names("b/(*)", names) == ["b/(z)"]
     assert match_names("a/.", names) == []
+    assert match_names("*/*x*", names) == ["a/x", "a/x.y", "b/x"]
+    assert match_names("a/x*x", names) == []
+
+
+def test_pattern_with_many_asterisks_is_matched_at_once():
+    name = f"line/{'a' * 60}"
+    assert match_names(f"*/{'*a' * 40}b", [name]) == []
+    assert match_names(f"*/{'*a' * 40}", [name]) == [name]
+
+
+@given(st.text("ab*/", max_size=8), st.text("ab/", max_size=8))
+def test_pattern_fits_as_its_regular_expression(pattern, name):
+    expression = "[^/]*".join(map(re.escape, pattern.split("*")))
+    assert bool(match_names(pattern, [name])) == bool(re.fullmatch(expression, name))
 
 
 def test_role_without_login():

@@ -260,7 +260,7 @@ def test_anonymous_viewer_sees_and_sets_nothing():
         client = await found.client()
         assert (await client.get("/api/v1/mixer/speed")).status == 200
         async with client.post(SETPOINT, json={"value": 50}) as answer:
-            message = "mixer/setpoint is set by operators: you are a viewer"
+            message = "mixer/setpoint is set by operators: your role is viewer"
             assert (answer.status, await reason(answer)) == (403, message)
 
     play(script, replace(CLOSED, anonymous=Role.VIEWER))
