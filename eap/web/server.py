@@ -32,6 +32,8 @@ MAX_CONNECTIONS = 512
 MAX_PER_HOST = 256
 HANDSHAKE_S = 10.0
 """Time for the TLS handshake of a connection."""
+SHUTDOWN_S = 2.0
+"""Time for the end of TLS of a connection."""
 SLOW_READER_S = 20.0
 _KEEPALIVE_S = 20.0
 _TYPES = {
@@ -195,8 +197,10 @@ class Connections:
         self._server = server
         self._listener = listener
         self._context = context
-        self._beginning: Counter[str] = Counter()
-        """Connections in their TLS handshake, by host."""
+        self._hosts: dict[web.RequestHandler, str] = {}
+        """Connections, with their host; closed ones until the next is accepted."""
+        self._beginning: set[web.RequestHandler] = set()
+        """Those in their TLS handshake."""
 
     async def accept(self, group: asyncio.TaskGroup) -> None:
         """Accept connections until cancelled."""
@@ -215,24 +219,26 @@ class Connections:
             group.create_task(self._begin(sock, host))
 
     def _is_full(self, host: str) -> bool:
-        hosts = Counter(self._beginning)
-        for handler in self._server.connections:
-            peer = handler.transport and handler.transport.get_extra_info("peername")
-            hosts[str(peer[0]) if peer else ""] += 1
+        known = self._beginning.union(self._server.connections)
+        self._hosts = {each: own for each, own in self._hosts.items() if each in known}
+        hosts = Counter(self._hosts.values())
         return hosts.total() >= MAX_CONNECTIONS or hosts[host] >= MAX_PER_HOST
 
     async def _begin(self, sock: socket.socket, host: str) -> None:
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(SLOW_READER_S * 1000))
-        self._beginning[host] += 1
-        timeouts = {} if self._context is None else {"ssl_handshake_timeout": HANDSHAKE_S}
+        handler = self._server()
+        self._hosts[handler] = host
+        self._beginning.add(handler)
+        timeouts = {}
+        if self._context is not None:
+            # A client that does not answer the end of TLS holds its place no longer than that.
+            timeouts = {"ssl_handshake_timeout": HANDSHAKE_S, "ssl_shutdown_timeout": SHUTDOWN_S}
         try:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(SLOW_READER_S * 1000))
             await asyncio.get_running_loop().connect_accepted_socket(
-                self._server, sock, ssl=self._context, **timeouts
+                lambda: handler, sock, ssl=self._context, **timeouts
             )
         except OSError as exc:  # ssl.SSLError, too: no TLS, or none that is known here
             logger.debug("connection from %s: %s", host, exc)
             sock.close()
         finally:
-            self._beginning[host] -= 1
-            if not self._beginning[host]:
-                del self._beginning[host]
+            self._beginning.discard(handler)

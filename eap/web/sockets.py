@@ -84,7 +84,8 @@ class Sockets:
         except* (OSError, TimeoutError, RuntimeError):
             # The client has gone, or does not read: close() would wait for it.
             if request.transport is not None:
-                request.transport.abort()
+                with suppress(AttributeError):  # asyncio: a TLS transport that was closed twice
+                    request.transport.abort()
         finally:
             del self._open[socket]
             self._topics.leave(slot)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import ssl
+import subprocess
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
 from time import monotonic
 
 import pytest
@@ -775,6 +778,53 @@ def test_silent_connections_are_closed(monkeypatch):
             assert [each.result() for each in ends] == [b""] * 3
 
     asyncio.run(script())
+
+
+def test_tls_connection_that_does_not_end_stops_no_other(tmp_path, monkeypatch):
+    made = []
+
+    class Seen(server.Connections):
+        def __init__(self, *given):
+            super().__init__(*given)
+            made.append(self)
+
+    monkeypatch.setattr(server, "Connections", Seen)
+    section = WebSection(listen="127.0.0.1:18324", tls=certificate(tmp_path))
+    trust = ssl.create_default_context(cafile=section.tls.certificate)
+
+    async def script() -> None:
+        with server.open_listener(section) as listener:
+            async with asyncio.timeout(60), LiveView(remote={"line": stub_client()}) as view:
+                application = server.PageServer(section, view, KEY).application()
+                context = server.tls_context(section)
+                async with server.serving(application, listener, context):
+                    reader, silent = await asyncio.open_connection("127.0.0.1", 18324, ssl=trust)
+                    reader._transport.pause_reading()
+                    while not made[0]._server.connections:  # noqa: ASYNC110  it does not tell
+                        await asyncio.sleep(0)
+                    (handler,) = made[0]._server.connections
+                    # asyncio forgets the protocol of a transport that is closed twice.
+                    handler.transport.close()
+                    handler.transport.close()
+                    reader, writer = await asyncio.open_connection("127.0.0.1", 18324, ssl=trust)
+                    writer.write(b"GET /icon.svg HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                    assert (await reader.readline()).startswith(b"HTTP/1.1 200")
+                    writer.close()
+                    silent.transport.abort()
+
+    asyncio.run(script())
+
+
+def certificate(folder: Path) -> WebTls:
+    """Make a certificate of this host, and return it with its key."""
+    tls = WebTls(certificate=str(folder / "page.crt"), key=str(folder / "page.key"))
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1",
+         "-nodes", "-subj", "/CN=page", "-addext", "subjectAltName=IP:127.0.0.1",
+         "-keyout", tls.key, "-out", tls.certificate],
+        capture_output=True, check=True,
+    )  # fmt: skip
+    return tls
 
 
 def test_port_in_use_is_named():
