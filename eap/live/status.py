@@ -20,6 +20,8 @@ class ApplianceStatus(msgspec.Struct, frozen=True):
     findings: list[dict[str, Any]] = []
     audit: dict[str, Any] | None = None
     listeners: list[dict[str, Any]] = []
+    host: str = ""
+    hosts: list[dict[str, Any]] = []
 
 
 class SilentAppliance(msgspec.Struct, frozen=True):

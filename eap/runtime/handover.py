@@ -13,6 +13,7 @@ from typing import Self
 import msgspec
 
 from eap.ams.spec import DirectoryStation, RoutingSpec
+from eap.config.plant_sections import HostSection
 from eap.config.record_sections import RecordSection
 from eap.config.web_sections import MetricsSection, WebSection
 from eap.ids import decode_value, encode_value
@@ -241,6 +242,8 @@ class Handover(InheritedRecord, frozen=True):
     """True if changes that cannot be recorded fail."""
     host: str = ""
     """Host of the plant that this computer is; empty without ``hosts``."""
+    hosts: tuple[HostSection, ...] = ()
+    """All hosts of the plant."""
 
     def port(self, name: PortName) -> PortSpec:
         """Return the specification of one port."""

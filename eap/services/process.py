@@ -63,6 +63,7 @@ from eap.services.device.sources import SourcePlayer
 from eap.services.device.station_device import StationDevice
 from eap.services.device.station_keeper import EngineClient, StationEngine, StationKeeper
 from eap.services.engine_link import EngineLink
+from eap.services.host_watch import HostWatch
 from eap.services.limited_log import LimitedLogHandler
 from eap.services.network import Network
 from eap.services.routing.route_rows import (
@@ -283,7 +284,13 @@ class Services:
         transports = Transports(network)
         sockets.on_change.append(transports.follow)
         brokers = self._brokers(devices)
-        methods = self._methods(images, buses, devices, audit, sockets)
+        hosts = HostWatch(
+            self._handover.host,
+            self._handover.hosts,
+            {each.name: each.net_id for each in self._handover.directory},
+            devices.routers,
+        )
+        methods = self._methods(images, buses, devices, audit, sockets, hosts)
         remote = RemoteControl(methods.call, devices.routers, record=audit.write_request)
         for name, router in devices.routers.items():
             router.add_service(router.net_id, ControlAds(name, remote))
@@ -302,6 +309,7 @@ class Services:
             tasks = [group.create_task(keep_serving(serve)) for serve in on_sockets]
             tasks.append(group.create_task(transports.serve()))
             tasks += [group.create_task(each.serve()) for each in (devices, audit, self._log)]
+            tasks.append(group.create_task(hosts.serve()))
             self._startup.finish({})
             await self._stopping.wait()
             # Cancel rather than raise: the TaskGroup then waits until all connections are closed.
@@ -382,6 +390,7 @@ class Services:
         devices: StationDevices,
         audit: Audit,
         sockets: SocketTable,
+        hosts: HostWatch,
     ) -> Methods:
         meter = ProcessMeter()
         engine = self._resources.enter_context(
@@ -412,7 +421,9 @@ class Services:
                 bridges,
             ) | {
                 "audit": audit.report(),
+                **({"host": hosts.own, "hosts": hosts.report()} if hosts.own else {}),
                 "findings": [
+                    *hosts.findings(),
                     *route_findings(devices.routers.values()),
                     *interruption_findings(devices.routers.values(), time()),
                     *(row for each in devices.by_station.values() for row in each.findings()),

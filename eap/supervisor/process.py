@@ -227,6 +227,7 @@ class Supervisor:
             directory=plant.directory,
             audit_required=plant.audit_required,
             host=info.host,
+            hosts=plant.hosts,
         )
         self._extras |= _optional_processes(plant, folder, self._bytecode)
         self._sockets = sockets

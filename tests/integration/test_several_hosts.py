@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from eap.release import RELEASE
 from tests.support.appliance import Appliance, Plants, plants, wait_until
 from tests.support.namespaces import Namespace, cable
 
@@ -179,17 +180,53 @@ def test_change_that_one_host_cannot_keep_is_taken_back_on_all(halls: Halls) -> 
     assert (code, out) == (0, "no differences: all 2 stations are as the file says\n"), err
 
 
+@pytest.mark.parametrize(
+    ("release", "severity", "note"),
+    [
+        ("0.0.9", "warning", f"host cell-b runs release 0.0.9, this eapctl is {RELEASE}\n"),
+        ("7.3.0", "error", ""),
+    ],
+)
+def test_other_release_of_a_host_is_named_and_works_one_apart(
+    halls: Halls,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    release: str,
+    severity: str,
+    note: str,
+) -> None:
+    script = f"import eap.release\neap.release.RELEASE = {release!r}\n"
+    (tmp_path / "sitecustomize.py").write_text(script)
+    with monkeypatch.context() as environment:
+        environment.setenv("PYTHONPATH", str(tmp_path))
+        halls.restart(1)
+    wait_until(lambda: named(halls.appliances[1]))
+    (finding,) = named(halls.appliances[1])
+    assert finding["severity"] == severity
+    assert finding["what"] == f"runs release {RELEASE}, this host {release}"
+    code, out, err = halls.eapctl("plan")
+    assert err == note
+    if note:
+        assert (code, out) == (0, "no differences: all 2 stations are as the file says\n")
+    else:
+        assert code == 1
+        assert "host cell-b (panel): it runs release 7.3.0, this eapctl is " in out
+
+
+def named(appliance: Appliance) -> list[dict[str, Any]]:
+    """Return the findings about other hosts."""
+    found = appliance.request("status")["findings"]
+    return [each for each in found if each["where"].startswith("host ")]
+
+
 def test_host_that_is_away_is_named_and_nothing_changes(halls: Halls) -> None:
     halls.appliances[1].stop()
-    try:
-        code, out, err = halls.eapctl("apply", text=LONGER)
-        assert code == 1, (out, err)
-        away = f"host cell-b (panel): {B} cannot be reached at port 48898: Connection refused"
-        assert out == f"{away}\nno station changed\n"
-        code, out, _ = halls.eapctl("plan", "--json", text=LONGER)
-        (host,) = json.loads(out)["away"]
-        assert (code, host["host"], host["stations"]) == (1, "cell-b", ["panel"])
-        code, _, err = halls.eapctl("plan", "--station", "panel")
-        assert (code, err) == (2, f"station panel is on host cell-b: {away.partition(': ')[2]}\n")
-    finally:
-        halls.restart(1)
+    code, out, err = halls.eapctl("apply", text=LONGER)
+    assert code == 1, (out, err)
+    away = f"host cell-b (panel): {B} cannot be reached at port 48898: Connection refused"
+    assert out == f"{away}\nno station changed\n"
+    code, out, _ = halls.eapctl("plan", "--json", text=LONGER)
+    (host,) = json.loads(out)["away"]
+    assert (code, host["host"], host["stations"]) == (1, "cell-b", ["panel"])
+    code, _, err = halls.eapctl("plan", "--station", "panel")
+    assert (code, err) == (2, f"station panel is on host cell-b: {away.partition(': ')[2]}\n")
