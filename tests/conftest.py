@@ -144,6 +144,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         "host_root": _lacks_host_root(),
         "tshark": _lacks_program("tshark", package="tshark"),
         "mosquitto": _lacks_program("mosquitto", package="mosquitto")
+        or _lacks_program("mosquitto_sub", package="mosquitto-clients")
         or _lacks_program("openssl", package="openssl"),
         "prometheus": _lacks_program("prometheus", package="prometheus"),
         "chromium": _lacks_program("chromium", package="chromium")

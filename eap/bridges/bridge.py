@@ -21,6 +21,8 @@ class Bridge:
 
     Args:
         plant: Name of the plant.
+        instance: Name of its appliance: that of the plant, or ``PLANT@STATION+…`` if it runs only
+            some of the stations.
         connect: Returns a client of its appliance that is not connected yet.
         ready: Called when the bridge runs.
         file: Where its status goes.
@@ -28,6 +30,7 @@ class Bridge:
 
     Attributes:
         plant: Name of the plant.
+        instance: Name of the appliance.
         is_ready: True once it has reported that it runs.
         status: Its status; the bridge changes the counters, the file follows once a second.
     """
@@ -35,6 +38,7 @@ class Bridge:
     def __init__(
         self,
         plant: str,
+        instance: str,
         connect: Callable[[], LiveClient],
         *,
         ready: Callable[[], None],
@@ -42,6 +46,7 @@ class Bridge:
         pid: int,
     ) -> None:
         self.plant = plant
+        self.instance = instance
         self.status = BridgeStatus(pid=pid, since=time())
         self._connect = connect
         self._writer = connect()

@@ -28,6 +28,7 @@ from eap.errors import ControlError
 from eap.live.client import LiveClient
 from eap.live.transport import ValuesSubscription
 from eap.pd.quality import QUALITY_NS
+from eap.pd.rules import MADE_SUFFIXES
 from eap.pd.spec import Writer
 
 DIRECTORY_S = 10.0
@@ -97,9 +98,10 @@ def select(
         rows: All variables of the station.
         station: Its name.
         patterns: ``STATION/NAME``, with ``*`` for any text; without, it may name a member.
+            Patterns do not fit the variables that control frames and PDs.
     """
     by_name = {row.name: row for row in rows}
-    names = [f"{station}/{name}" for name in by_name]
+    names = [f"{station}/{name}" for name in by_name if not name.endswith(MADE_SUFFIXES)]
     found: dict[str, BridgeVariable] = {}
     for pattern in patterns:
         chosen = match_names(pattern, names) if "*" in pattern else [pattern]

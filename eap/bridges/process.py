@@ -56,6 +56,7 @@ def run_bridge(
     async def run() -> str:
         bridge = Bridge(
             handover.plant,
+            folder.path.name,
             connect,
             ready=partial(startup.finish, {}),
             file=BridgeFile(folder.path, handover.name),

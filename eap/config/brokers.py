@@ -10,6 +10,7 @@ from eap.ams.mqtt.messages import check_network
 from eap.ams.spec import MqttSpec, TlsSpec, TransportKind
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index
+from eap.config.mqtt_sections import MqttSection
 from eap.config.structs import RouteSection, StationSection, TlsSection
 from eap.ids import parse_host
 from eap.suggest import suggest
@@ -106,7 +107,7 @@ def check_brokers(index: Index, report: FindingReport, folder: Path) -> None:
         _check_networks(station, report)
         for route in brokers_of(station):
             broker = _check_url(route, report)
-            _check_credentials(route, report, folder)
+            check_credentials(route, report, folder)
             if broker is not None and route.client_id:
                 first = client_ids.setdefault((broker, route.client_id), route)
                 if first is not route:
@@ -155,7 +156,10 @@ def _is_network(name: str) -> bool:
     return not any(each == "/" or each.isspace() for each in name)
 
 
-def _check_credentials(route: RouteSection, report: FindingReport, folder: Path) -> None:
+def check_credentials(
+    route: RouteSection | MqttSection, report: FindingReport, folder: Path
+) -> None:
+    """Report an invalid login or TLS section of a client of a broker; files are in *folder*."""
     if route.password_file and not route.user:
         report.add(f"{route.at}.password_file", "a password without a user", "user: as well")
     check_file(f"{route.at}.password_file", route.password_file, report, folder)

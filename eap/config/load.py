@@ -50,6 +50,7 @@ from eap.config.finding import FindingReport, PlantFinding
 from eap.config.hosts import check_hosts, is_served_on
 from eap.config.index import Index, SentPd, VariablePart
 from eap.config.links import check_links, ends, execution_order, is_bitwise
+from eap.config.mqtt import check_mqtt, mqtt_spec, warn_of_commands
 from eap.config.plant_sections import HostSection, PlantFile
 from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
 from eap.config.record import check_recordings, records_of, resolved_recordings
@@ -69,7 +70,6 @@ from eap.config.structs import (
     FrameSection,
     FromSection,
     PortSection,
-    Section,
     StationSection,
     SubscribeSection,
     VariableSection,
@@ -494,7 +494,7 @@ class Plant(msgspec.Struct, frozen=True):
     """Metrics without a page, with resolved paths; None without them."""
     record: tuple[RecordSection, ...] = ()
     """Recordings that run beside the plant, with resolved paths."""
-    bridges: Mapping[str, Section] = {}
+    bridges: Mapping[str, msgspec.Struct] = {}
     """Sections of the bridges, by their keys, with resolved paths."""
 
     def on_host(self, host: HostSection) -> Plant:
@@ -507,6 +507,14 @@ class Plant(msgspec.Struct, frozen=True):
             metrics=metrics if metrics is None or is_served_on(host, metrics.listen) else None,
             record=tuple(each for each in self.record if records_of(each, host.stations)),
         )
+
+
+def _bridges(index: Index, folder: Path) -> dict[str, msgspec.Struct]:
+    """Return the sections of the bridges of a plant without findings, by their keys."""
+    found: dict[str, msgspec.Struct] = {}
+    if (mqtt := index.plant.mqtt) is not None:
+        found[mqtt.KEY] = mqtt_spec(index, mqtt, folder)
+    return found
 
 
 class PlantResult(msgspec.Struct, frozen=True):
@@ -551,6 +559,7 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
     check_discovery(index, report)
     check_access(index, report, path.parent)
     check_web(index, report, path.parent)
+    check_mqtt(index, report, path.parent)
     check_hosts(index, report)
     check_recordings(index, report)
     # Derived only from a plant without findings, so nothing below can fail.
@@ -567,12 +576,14 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
         web=plant_file.web and resolved(plant_file.web, path.parent),
         metrics=plant_file.metrics and resolved_tls(plant_file.metrics, path.parent),
         record=resolved_recordings(plant_file.record, path.parent),
+        bridges=_bridges(index, path.parent),
     )
     warnings = (
         *report.warnings,
         *follow_routes(index, plant.routing, report),
         *warn_of_open_brokers(index, report),
         *warn_of_pictures(index, report, path.parent),
+        *warn_of_commands(index, report),
     )
 
     return PlantResult(plant, (), report.lines, warnings, types)

@@ -61,7 +61,8 @@ class MqttLink(ReconnectingLink):
     Args:
         spec: Its address, and the login of this client.
         client_id: At the broker.
-        will: Published by the broker when this end is lost, and by this end when it closes.
+        will: Returns what the broker publishes when this end is lost, and this end when it closes;
+            called for each connection.
         handlers: Callbacks.
 
     Raises:
@@ -69,13 +70,13 @@ class MqttLink(ReconnectingLink):
     """
 
     def __init__(
-        self, spec: MqttSpec, client_id: str, *, will: Publish, handlers: Handlers
+        self, spec: MqttSpec, client_id: str, *, will: Callable[[], Publish], handlers: Handlers
     ) -> None:
         require_mqtt()
         super().__init__(ReconnectPolicy(FIRST_PAUSE_S, LONGEST_PAUSE_S, _STABLE_S))
         self._spec = spec
         self._client_id = client_id
-        self._will = will
+        self._make_will = will
         self._handlers = handlers
         self._name = f"MQTT broker {spec.host}:{spec.port}"
         self._outbox: asyncio.Queue[Outgoing] = asyncio.Queue()
@@ -84,6 +85,11 @@ class MqttLink(ReconnectingLink):
         self._is_old = False
         self._is_silent = False
         self._connections = self._connections_before = 0
+
+    @property
+    def waiting(self) -> int:
+        """Number of messages that wait to be sent."""
+        return self._outbox.qsize()
 
     def send(self, message: Outgoing) -> str | None:
         """Queue *message*; return the reason if it cannot be sent, else None."""
@@ -115,16 +121,17 @@ class MqttLink(ReconnectingLink):
         try:
             if self._is_silent:
                 await self._probe()
+            will = self._make_will()
             client = make_client(
                 self._spec.host, self._spec.port, self._client_id,
-                login=self._login(), tls=tls_context(self._spec.tls), will=self._will,
+                login=self._login(), tls=tls_context(self._spec.tls), will=will,
                 keepalive_s=KEEPALIVE_S, is_old=self._is_old,
             )  # fmt: skip
         except (OSError, UnicodeError, EnvironmentalError) as exc:  # what files hold
             return str(exc) or "timed out"
         try:
             async with client:
-                await self._serve(client)
+                await self._serve(client, will)
             why = "it was closed"
         except MqttError as exc:
             # Tried by turns, since the reason is not certain: some brokers just say nothing.
@@ -150,7 +157,7 @@ class MqttLink(ReconnectingLink):
         writer.close()
         await writer.wait_closed()
 
-    async def _serve(self, client: MqttClient) -> None:
+    async def _serve(self, client: MqttClient, will: Publish) -> None:
         self._outbox = asyncio.Queue()
         self._octets = 0
         self._is_connected = True
@@ -167,7 +174,7 @@ class MqttLink(ReconnectingLink):
         except asyncio.CancelledError:
             with suppress(Exception):  # the broker gets to know in any case
                 async with asyncio.timeout(_DISCONNECT_S):
-                    await _publish(client, self._will)
+                    await _publish(client, will)
             raise
         except ExceptionGroup as group_error:
             first = group_error.exceptions[0]

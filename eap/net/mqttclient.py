@@ -9,6 +9,7 @@ import asyncio
 import logging
 import ssl
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import aiomqtt
 from aiomqtt import Message, MqttError
@@ -103,6 +104,24 @@ class MqttClient(aiomqtt.Client):
     def limit_connect(self, timeout_s: float) -> None:
         """Set how long the thread may wait that connects."""
         self._client.connect_timeout = timeout_s
+
+    def _on_socket_register_write(self, client: Any, userdata: Any, sock: Any) -> None:
+        """Have the loop write when *sock* takes more; called by paho, also in a thread."""
+
+        # aiomqtt passes the loop the number of a socket that may be closed by the time the loop
+        # comes to it, and then an error, or another socket has the number.
+        def register() -> None:
+            if sock.fileno() >= 0:
+                self._loop.add_writer(sock.fileno(), write)
+
+        def write() -> None:
+            try:
+                client.loop_write()
+            except Exception as exc:  # noqa: BLE001  as aiomqtt does: the connection is lost
+                if not self._disconnected.done():
+                    self._disconnected.set_exception(exc)
+
+        self._loop.call_soon_threadsafe(register)
 
     def close(self) -> None:
         """Close the connection, also one that was abandoned during its set-up."""

@@ -23,12 +23,12 @@ from msgspec import Struct
 from eap.codec import datatypes
 from eap.codec.arrays import Array
 from eap.codec.basetypes import Block, Boolean, DataType, Integer, Real, Text, WideChar
+from eap.codec.protobuf import FIXED32, FIXED64, LENGTH, VARINT, encode_field, encode_tag, varint
 from eap.codec.structures import Structure
 from eap.errors import MalformedError
 
 PACKAGE = "eap"
 CYCLE_FIELD = "cycle_number"
-_VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
 _RESERVED = range(19_000, 20_000)
 """Field numbers that protobuf keeps for itself."""
 
@@ -49,13 +49,13 @@ class FieldType(IntEnum):
 
 
 _WIRE = {
-    FieldType.DOUBLE: (_FIXED64, 8, "d"),
-    FieldType.FLOAT: (_FIXED32, 4, "f"),
-    FieldType.FIXED64: (_FIXED64, 8, "Q"),
-    FieldType.FIXED32: (_FIXED32, 4, "I"),
-    FieldType.BOOL: (_VARINT, 1, "?"),
-    FieldType.SFIXED32: (_FIXED32, 4, "i"),
-    FieldType.SFIXED64: (_FIXED64, 8, "q"),
+    FieldType.DOUBLE: (FIXED64, 8, "d"),
+    FieldType.FLOAT: (FIXED32, 4, "f"),
+    FieldType.FIXED64: (FIXED64, 8, "Q"),
+    FieldType.FIXED32: (FIXED32, 4, "I"),
+    FieldType.BOOL: (VARINT, 1, "?"),
+    FieldType.SFIXED32: (FIXED32, 4, "i"),
+    FieldType.SFIXED64: (FIXED64, 8, "q"),
 }
 """Wire type, bytes, and code of ``struct``, of the types of numbers."""
 
@@ -87,28 +87,6 @@ class _PartGroup(NamedTuple):
 
 
 _Part: TypeAlias = "bytes | Leaf | _PartGroup"
-
-
-def varint(number: int) -> bytes:
-    """Return *number* in groups of seven bits, the lowest first."""
-    octets = bytearray()
-    while number > 0x7F:
-        octets.append(number & 0x7F | 0x80)
-        number >>= 7
-    octets.append(number)
-    return bytes(octets)
-
-
-def _tag(number: int, wire: int) -> bytes:
-    return varint(number << 3 | wire)
-
-
-def _field(number: int, content: bytes | str | int) -> bytes:
-    """Return one field of a descriptor."""
-    if isinstance(content, int):
-        return _tag(number, _VARINT) + varint(content)
-    octets = content.encode() if isinstance(content, str) else content
-    return _tag(number, _LENGTH) + varint(len(octets)) + octets
 
 
 _FIELD_TYPES: tuple[tuple[type[DataType], FieldType], ...] = (
@@ -184,11 +162,11 @@ def _parts(number: int, path: str, kind: DataType, bit_offset: int) -> Iterator[
     )
     if wire is None:
         for leaf in leaves:
-            yield _PartGroup(_tag(number, _LENGTH), list(_content(leaf)))
+            yield _PartGroup(encode_tag(number, LENGTH), list(_content(leaf)))
     elif isinstance(kind, Array):
-        yield _PartGroup(_tag(number, _LENGTH), list(leaves))
+        yield _PartGroup(encode_tag(number, LENGTH), list(leaves))
     else:
-        yield _tag(number, wire[0])
+        yield encode_tag(number, wire[0])
         yield from leaves
 
 
@@ -335,7 +313,7 @@ class _Packer:
         return self._pack(_CYCLE_TAG, cycle, *values)
 
 
-_CYCLE_TAG = _tag(1, _FIXED64)[0]
+_CYCLE_TAG = encode_tag(1, FIXED64)[0]
 
 
 def _runs(parts: Sequence[bytes | Leaf]) -> Iterator[tuple[bytes, list[Leaf]]]:
@@ -553,12 +531,12 @@ class StationMessages:
             fields.append(types.field(name, number, datatypes.parse(variable.type)))
         types.add(types.root, fields)
         file = (
-            _field(1, f"{types.root}.proto")
-            + _field(2, PACKAGE)
-            + b"".join(_field(4, each) for each in types.messages)
-            + _field(12, "proto3")
+            encode_field(1, f"{types.root}.proto")
+            + encode_field(2, PACKAGE)
+            + b"".join(encode_field(4, each) for each in types.messages)
+            + encode_field(12, "proto3")
         )
-        return _field(1, file)
+        return encode_field(1, file)
 
 
 def _leaves(parts: Iterable[_Part]) -> Iterator[Leaf]:
@@ -583,8 +561,14 @@ _OPTIONAL, _REPEATED = 1, 3
 def _field_descriptor(
     name: str, number: int, kind: FieldType, label: int = _OPTIONAL, type_name: str = ""
 ) -> bytes:
-    named = _field(6, type_name) if type_name else b""
-    return _field(1, name) + _field(3, number) + _field(4, label) + _field(5, kind) + named
+    named = encode_field(6, type_name) if type_name else b""
+    return (
+        encode_field(1, name)
+        + encode_field(3, number)
+        + encode_field(4, label)
+        + encode_field(5, kind)
+        + named
+    )
 
 
 class _MessageTypes:
@@ -597,7 +581,9 @@ class _MessageTypes:
 
     def add(self, name: str, fields: Iterable[bytes]) -> None:
         """Add the type *name*."""
-        self.messages.append(_field(1, name) + b"".join(_field(2, each) for each in fields))
+        self.messages.append(
+            encode_field(1, name) + b"".join(encode_field(2, each) for each in fields)
+        )
 
     def field(self, name: str, number: int, kind: DataType) -> bytes:
         """Return the descriptor of one field, whose type is added if it is a struct."""

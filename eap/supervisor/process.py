@@ -81,6 +81,7 @@ _EXTRAS = {
     "web": _Extra("eap.web.process", "aiohttp", "web"),
     "metrics": _Extra("eap.web.process", "aiohttp", "web"),
     "recording": _Extra("eap.recording.process", "mcap", "record"),
+    "mqtt": _Extra("eap.bridges.mqtt.process", "aiomqtt", "mqtt"),
 }
 """Optional processes by their keys in the plant file."""
 SEGMENT_GRACE_NS = 500_000_000

@@ -41,6 +41,11 @@ class Broker:
                  *(settings or ("allow_anonymous true",))]  # fmt: skip
         self._config.write_text("\n".join(lines) + "\n")
 
+    @property
+    def pid(self) -> int:
+        """Process id, 0 while it does not run."""
+        return 0 if self._process is None else self._process.pid
+
     def start(self) -> None:
         """Start it and wait until it listens."""
         program = mosquitto()

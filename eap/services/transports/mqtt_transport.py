@@ -68,7 +68,7 @@ class MqttTransport:
         self._link = MqttLink(
             spec,
             spec.client_id or f"eap-{router.net_id}-{spec.network}",
-            will=self._network.will(),
+            will=self._network.will,
             handlers=Handlers(self._connected, self._lost, self._receive, self._overrun),
         )
         self._timer: asyncio.TimerHandle | None = None

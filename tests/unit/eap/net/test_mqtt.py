@@ -39,7 +39,7 @@ class Peer:
         spec = MqttSpec(network="hall", **{"host": ADDRESS, **settings})
         self.overruns = 0
         self.link = MqttLink(
-            spec, name, will=WILL,
+            spec, name, will=lambda: WILL,
             handlers=Handlers(self._connected, self.lost.append, self._hear, self._overrun),
         )  # fmt: skip
 
@@ -293,7 +293,7 @@ def test_mqtt_writer_ends_with_a_connection_that_breaks_as_the_broker_confirms()
         peer = Peer()
         with pytest.raises(mqttclient.MqttError, match="the cable"):
             async with asyncio.timeout(20):
-                await peer.link._serve(Client())
+                await peer.link._serve(Client(), WILL)
 
     play(story)
 
