@@ -8,7 +8,7 @@ from time import time
 from typing import Any, Literal
 
 from eap.bridges.feed import BridgeFeed, Sample
-from eap.control.protocol import WRITE, WriteOrigin
+from eap.control.protocol import WRITE, AnswerT, Method, ParametersT, WriteOrigin
 from eap.errors import EapError
 from eap.live.client import LiveClient
 from eap.runtime.bridges import BridgeFile, BridgeStatus
@@ -117,6 +117,18 @@ class Bridge:
         except EapError:
             self.status.refused += 1
             raise
+
+    async def request(self, method: str) -> Any:
+        """Return the result of a method of the control protocol that needs no parameters.
+
+        Raises:
+            EapError: it is refused, or the appliance does not answer.
+        """
+        return await self._writer.request(method)
+
+    async def call(self, method: Method[ParametersT, AnswerT], /, **params: Any) -> AnswerT:
+        """Return the answer to a method of the control protocol; raises as :meth:`request`."""
+        return await self._writer.call(method, **params)
 
     async def report(self) -> None:
         """Keep the file of the status current until cancelled."""

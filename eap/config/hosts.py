@@ -249,8 +249,8 @@ def _check_senders(index: Index, station: StationSection, report: FindingReport)
 
 
 def _check_servers(index: Index, report: FindingReport) -> None:
-    """Report a page or metrics at an address that no host has."""
-    for section in (index.plant.web, index.plant.metrics):
+    """Report a page, metrics or an OPC UA server at an address that no host has."""
+    for section in (index.plant.web, index.plant.metrics, index.plant.opcua):
         if section is None:
             continue
         try:

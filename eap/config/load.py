@@ -51,6 +51,8 @@ from eap.config.hosts import check_hosts, is_served_on
 from eap.config.index import Index, SentPd, VariablePart
 from eap.config.links import check_links, ends, execution_order, is_bitwise
 from eap.config.mqtt import check_mqtt, mqtt_spec, warn_of_commands
+from eap.config.opcua import check_opcua, resolved_opcua, warn_of_open_channels
+from eap.config.opcua_sections import OpcUaSection
 from eap.config.plant_sections import HostSection, PlantFile
 from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
 from eap.config.record import check_recordings, records_of, resolved_recordings
@@ -506,6 +508,11 @@ class Plant(msgspec.Struct, frozen=True):
             web=web if web is None or is_served_on(host, web.listen) else None,
             metrics=metrics if metrics is None or is_served_on(host, metrics.listen) else None,
             record=tuple(each for each in self.record if records_of(each, host.stations)),
+            bridges={
+                key: each
+                for key, each in self.bridges.items()
+                if not isinstance(each, OpcUaSection) or is_served_on(host, each.listen)
+            },
         )
 
 
@@ -514,6 +521,8 @@ def _bridges(index: Index, folder: Path) -> dict[str, msgspec.Struct]:
     found: dict[str, msgspec.Struct] = {}
     if (mqtt := index.plant.mqtt) is not None:
         found[mqtt.KEY] = mqtt_spec(index, mqtt, folder)
+    if (opcua := index.plant.opcua) is not None:
+        found[opcua.KEY] = resolved_opcua(opcua, folder)
     return found
 
 
@@ -560,6 +569,7 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
     check_access(index, report, path.parent)
     check_web(index, report, path.parent)
     check_mqtt(index, report, path.parent)
+    check_opcua(index, report, path.parent)
     check_hosts(index, report)
     check_recordings(index, report)
     # Derived only from a plant without findings, so nothing below can fail.
@@ -584,6 +594,7 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
         *warn_of_open_brokers(index, report),
         *warn_of_pictures(index, report, path.parent),
         *warn_of_commands(index, report),
+        *warn_of_open_channels(index, report),
     )
 
     return PlantResult(plant, (), report.lines, warnings, types)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from eap.config.mqtt_sections import MqttSection
+from eap.config.opcua_sections import OpcUaSection
 from eap.config.record_sections import RecordSection
 from eap.config.structs import Defaults, PlantAccess, Section, StationSection, TypeSection
 from eap.config.web_sections import MetricsSection, WebSection
@@ -40,3 +41,4 @@ class PlantFile(Section, frozen=True, kw_only=True):
     metrics: MetricsSection | None = None
     record: tuple[RecordSection, ...] = ()
     mqtt: MqttSection | None = None
+    opcua: OpcUaSection | None = None

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from msgspec import UNSET, Meta, UnsetType
 
 from eap.ams.spec import RoutingSpec
-from eap.control.protocol import Document, Method, Parameters
+from eap.control.protocol import Document, Method, Parameters, WriteOrigin
 from eap.device.configuration import EntryChange
 from eap.device.eap_state import StateResult
 from eap.device.rollout import without_alternates
@@ -73,9 +73,10 @@ class OdDumpParameters(TargetParameters, frozen=True, kw_only=True):
 
 
 class RequestStateParameters(TargetParameters, frozen=True, kw_only=True):
-    """``request_state``."""
+    """``request_state``; *origin* is the author, if a program requests it for a user."""
 
     state: str
+    origin: WriteOrigin | None = None
 
 
 class StationParameters(Parameters, frozen=True, kw_only=True):

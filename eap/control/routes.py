@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 from msgspec import Meta, field
 
 from eap.ams.report import HopReport
-from eap.control.protocol import Document, Method, Parameters
+from eap.control.protocol import Document, Method, Parameters, WriteOrigin
 
 PAGE = 1000
 """Limit of the routes in one answer."""
@@ -386,12 +386,14 @@ class AskParameters(TraceParameters, frozen=True, kw_only=True):
     """``ams_ask``: one ADS request; *data* follows the header, in hexadecimal digits.
 
     With *device* a station name is the address of its first EAP port, not that of its router.
+    *origin* is the author, if a program asks for a user.
     """
 
     command: Annotated[int, Meta(ge=1, le=0xFFFF)]
     data: str = ""
     device: bool = False
     timeout_ms: Annotated[int, Meta(ge=1, le=MAX_TIMEOUT_MS)] = 5000
+    origin: WriteOrigin | None = None
 
 
 class SlaveEntry(Document, frozen=True):

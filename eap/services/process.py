@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 from eap.ams.directory import Directory
 from eap.ams.spec import DirectoryPort, DirectoryStation, RoutingSpec
 from eap.control.by_ads import METHODS
+from eap.control.protocol import WriteOrigin
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.net import realtime
@@ -75,6 +76,7 @@ from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import (
     StationRoutes,
     access_of,
+    denial_of_control,
     denial_of_write,
     make_router,
 )
@@ -451,11 +453,17 @@ class Services:
         }
         routers = {name: ads.dictionary for name, ads in devices.ads.items()}
         plant_file = self._handover.plant_file
+
+        def deny_control(station: str, origin: WriteOrigin) -> str:
+            return denial_of_control(devices.routers[station], origin)
+
         return {
-            **DeviceMethods(devices.by_station, routers, plant_file).table(),
+            **DeviceMethods(devices.by_station, routers, plant_file, deny_control).table(),
             **RouteMethods(views, self._directory).table(),
             **RoutingMethods(devices.routing).table(),
-            **AmsMethods(devices.routers, self._directory, sockets.ams_address).table(),
+            **AmsMethods(
+                devices.routers, self._directory, sockets.ams_address, deny_control
+            ).table(),
         }
 
     def _audit(self, routers: Mapping[str, StationRouter]) -> Audit:

@@ -82,6 +82,7 @@ _EXTRAS = {
     "metrics": _Extra("eap.web.process", "aiohttp", "web"),
     "recording": _Extra("eap.recording.process", "mcap", "record"),
     "mqtt": _Extra("eap.bridges.mqtt.process", "aiomqtt", "mqtt"),
+    "opcua": _Extra("eap.bridges.opcua.process", "asyncua", "opcua"),
 }
 """Optional processes by their keys in the plant file."""
 SEGMENT_GRACE_NS = 500_000_000

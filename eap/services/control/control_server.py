@@ -97,7 +97,7 @@ def change_of(
         number = params.get("conversation")
         conversation = opened(number) if isinstance(number, int) else None
         return None if conversation is None else _conversation_change(conversation, params)
-    if request.method not in _CHANGES or (request.method == "bus_transfer" and _are_reads(params)):
+    if not _is_change(request):
         return None
     described = {key: _shortened(value) for key, value in params.items() if key not in _HIDDEN}
     described.pop("origin", None)
@@ -111,6 +111,15 @@ def change_of(
         described.pop("station", "") or str(described.get("target", "")).partition("/")[0]
     )
     return station, {"operation": request.method, "asked": described} | author
+
+
+def _is_change(request: Request) -> bool:
+    if request.method == "ams_ask":
+        # An ADS request has a line of its own, which does not know its author.
+        return request.params.get("origin") is not None
+    if request.method == "bus_transfer":
+        return not _are_reads(request.params)
+    return request.method in _CHANGES
 
 
 def error_in_result(result: Any, conversation: BusOpenParameters | None = None) -> str:

@@ -9,7 +9,7 @@ import msgspec
 
 from eap.control import device as records
 from eap.control.bus import to_octets
-from eap.control.protocol import ErrorCode, of_station
+from eap.control.protocol import ErrorCode, WriteOrigin, of_station
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.live_dictionaries import RouterDictionary
 from eap.errors import ControlError
@@ -36,6 +36,8 @@ class DeviceMethods:
         devices: By station.
         routers: What the routers of these stations are.
         plant_file: With which the appliance was started.
+        deny_control: Returns the reason that a user of a bridge may not change the state of a
+            station, empty if it may.
     """
 
     def __init__(
@@ -43,10 +45,12 @@ class DeviceMethods:
         devices: Mapping[str, StationDevice],
         routers: Mapping[str, RouterDictionary],
         plant_file: str,
+        deny_control: Callable[[str, WriteOrigin], str] = lambda *_: "",
     ) -> None:
         self._devices = devices
         self._routers = routers
         self._plant_file = plant_file
+        self._deny_control = deny_control
 
     def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         """Return the methods by name; results may have to be waited for.
@@ -125,6 +129,10 @@ class DeviceMethods:
 
     async def _request_state(self, wanted: records.RequestStateParameters) -> records.StateAnswer:
         device = self._find(wanted.target).device
+        if (origin := wanted.origin) is not None:
+            station = wanted.target.partition("/")[0]
+            if why := self._deny_control(station, origin):
+                raise ControlError(f"station {station}: {why}", code=ErrorCode.REFUSED)
         return records.state_answer(await device.request_state(records.state_of(wanted.state)))
 
     def _export(self, wanted: records.StationParameters) -> records.RunningSpec:

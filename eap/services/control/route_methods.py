@@ -20,7 +20,7 @@ from eap.control import device as device_records
 from eap.control import routes as records
 from eap.control.bus import to_octets
 from eap.control.device import RoutingDifference
-from eap.control.protocol import ErrorCode, of_station, unless_unavailable
+from eap.control.protocol import ErrorCode, WriteOrigin, of_station, unless_unavailable
 from eap.errors import ControlError
 from eap.ids import NetId
 from eap.services.routing.remote_routers import (
@@ -46,6 +46,8 @@ class AmsMethods:
         routers: By station.
         directory: Names of the plant.
         address_of: Returns where a station is reached by AMS/TCP; empty if it is not.
+        deny_control: Returns the reason that a user of a bridge may not control a device by a
+            station's router, empty if it may.
     """
 
     def __init__(
@@ -53,10 +55,12 @@ class AmsMethods:
         routers: Mapping[str, StationRouter],
         directory: Directory,
         address_of: Callable[[str], str],
+        deny_control: Callable[[str, WriteOrigin], str] = lambda *_: "",
     ) -> None:
         self._routers = routers
         self._directory = directory
         self._address_of = address_of
+        self._deny_control = deny_control
 
     def table(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
         """Return the methods by name; all have to be waited for.
@@ -94,6 +98,8 @@ class AmsMethods:
     async def _ask(self, wanted: records.AskParameters) -> records.AmsReply:
         find = self._directory.find_device if wanted.device else self._directory.find
         router, address = self._router(wanted.via), _resolve(find, wanted.target)
+        if wanted.origin is not None and (why := self._deny_control(router.name, wanted.origin)):
+            raise ControlError(f"station {router.name}: {why}", code=ErrorCode.REFUSED)
         timeout_s = wanted.timeout_ms / 1000
         data = to_octets(wanted.data)
         answer = await router.request(*address, wanted.command, data, timeout_s=timeout_s)

@@ -16,7 +16,7 @@ from ipaddress import IPv4Address
 
 from msgspec.structs import replace
 
-from eap.ads.request import Write
+from eap.ads.request import Operation, Write, WriteControl
 from eap.ams.access import AccessList
 from eap.ams.routes import Origin, Route
 from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
@@ -113,10 +113,19 @@ def denial_of_write(router: StationRouter, origin: WriteOrigin) -> str:
     Returns:
         The rule, or the default, in words; empty if it may.
     """
+    return _denial_of(router, origin, Write(IndexGroup.VALUE_BY_HANDLE, 0, b""))
+
+
+def denial_of_control(router: StationRouter, origin: WriteOrigin) -> str:
+    """Return likewise the reason that such a user may not change the state of a station."""
+    return _denial_of(router, origin, WriteControl(0, 0, b""))
+
+
+def _denial_of(router: StationRouter, origin: WriteOrigin, operation: Operation) -> str:
     # These clients have no NetID, and their addresses no port that would tell anything.
     endpoint = Endpoint(TransportKind(origin.transport), origin.host)
     grants = router.access.grants(endpoint, NetId(b""), router.net_id, IO_PORT)
-    decision = grants.decide(Write(IndexGroup.VALUE_BY_HANDLE, 0, b""))
+    decision = grants.decide(operation)
     is_by_role = endpoint.kind in _WITH_ROLES and not decision.is_by_rule
     return "" if decision.is_allowed or is_by_role else decision.why
 
