@@ -134,6 +134,8 @@ class PlantFeed:
         on_values: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.report: LiveReport | None = None
+        self.plant = ""
+        """Name of the plant, empty until it has answered."""
         self.directories: dict[str, _Directory] = {}
         self.directory_version = 0
         self._view = view
@@ -155,14 +157,6 @@ class PlantFeed:
             while True:
                 await self._take_status()
                 await asyncio.sleep(STATUS_S)
-
-    @property
-    def plant(self) -> str:
-        """Name of the plant, empty while none answers."""
-        report = self.report
-        if report is None or not report.status.appliances:
-            return ""
-        return report.status.appliances[0].plant
 
     def stations(self) -> list[str]:
         """Return the names of the stations that were ever seen."""
@@ -361,6 +355,8 @@ class PlantFeed:
     async def _take_status(self) -> None:
         self.report = report = await self._view.take()
         self._reports.append(report)
+        if report.status.appliances:
+            self.plant = report.status.appliances[0].plant
         for row in report.status.stations:
             directory = self.directories.get(row["name"])
             if directory is None:

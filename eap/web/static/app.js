@@ -132,12 +132,12 @@ class App {
     setText(byId("plant"), plant || this.session.plant || "EAP");
     setText(byId("clock"), formatTime(time));
     setAttribute(byId("clock"), "data-date", new Date(time * 1000).toLocaleDateString(language)); // on paper
+    const silent = Object.entries(unreachable ?? {}).map(([name, why]) => (why.startsWith(`${name}: `) ? why : `${name}: ${why}`));
     const count = (severity) => findings.filter((each) => each.severity === severity).length;
-    const [errors, warnings] = [count("error"), count("warning")];
+    const [errors, warnings] = [count("error") + silent.length, count("warning")];
     const text = [errors && `■ ${t("errors")} ${errors}`, warnings && `▲ ${t("warnings")} ${warnings}`].filter(Boolean).join("  ");
     setText(byId("findings"), text || t("no_findings_short"));
     setAttribute(byId("findings"), "class", errors ? "alarm" : warnings ? "warn" : null);
-    const silent = Object.entries(unreachable ?? {}).map(([name, why]) => `${name}: ${why}`);
     if (this.connection.state === "open") setText(byId("banner"), silent.length ? `▲ ${t("unreachable", { reasons: silent.join("; ") })}` : "");
     const sign = errors ? "■ " : warnings ? "▲ " : "";
     const title = `${sign}${this.title ? `${this.title} – ` : ""}${plant || "EAP"}`;

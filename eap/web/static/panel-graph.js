@@ -19,6 +19,7 @@ export function graphPanel(panel, scope) {
   const frame = h("div", { class: "graph-frame" }, svg);
   const flows = table(t("process_data"), [t("from"), t("pd"), t("to"), t("subscription"), t("state"),
     { text: t("rate"), number: true }, { text: t("age"), number: true }, { text: t("lost"), number: true }, { text: t("late"), number: true }, { text: t("jitter"), number: true }], { class: "flows" });
+  const none = h("p", { class: "note" }, t("no_stations"));
   const details = h("details", {}, h("summary", {}, t("process_data")), flows.frame);
   const rows = new Rows(flows.body);
   const losses = new Losses();
@@ -32,6 +33,9 @@ export function graphPanel(panel, scope) {
     const links = linksOf(message, panel.of);
     losses.take(links);
     const names = nodesOf(message, links, panel.of);
+    none.hidden = names.length > 0;
+    frame.hidden = details.hidden = !names.length;
+    if (!names.length) return;
     const shape = JSON.stringify([width, names, [...new Set(links.map((each) => each.arrow))]]);
     if (drawing?.shape !== shape && width) drawing = draw(svg, names, links, width, shape);
     if (drawing) update(drawing, message, links, losses);
@@ -48,7 +52,7 @@ export function graphPanel(panel, scope) {
   });
   size.observe(frame);
   scope.atEnd(() => size.disconnect());
-  return h("div", {}, frame, details);
+  return h("div", {}, none, frame, details);
 }
 
 function linksOf(message, of) {

@@ -683,6 +683,20 @@ def test_values_grow_stale_while_the_plant_does_not_answer_and_come_back():
     play(script)
 
 
+def test_plant_that_ends_keeps_its_name_and_pages():
+    async def script(found: Site) -> None:
+        client = await found.client()
+        socket = await subscribed(client, "plant")
+        found.plant.answers = False
+        while not (await of_type(socket, "plant"))["unreachable"]:
+            pass
+        pages = (await (await client.get("/api/v1/pages")).json())["pages"]
+        assert [each["name"] for each in pages] == ["line", "mixer"]
+        assert (await (await client.get("/api/v1/session")).json())["plant"] == "line"
+
+    play(script, WebSection())
+
+
 def test_metrics_count_plants_that_do_not_answer():
     async def script(found: Site) -> None:
         client = await found.client()
