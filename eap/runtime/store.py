@@ -359,10 +359,10 @@ def lean(value: Any) -> Any:
     if isinstance(value, msgspec.Struct):
         tag, defaults = _outline(type(value))
         fields = {"kind": tag} if tag is not None else {}
-        for name, default in defaults:
+        for name, key, default in defaults:
             held = getattr(value, name)
             if held != default:
-                fields[name] = lean(held)
+                fields[key] = lean(held)
         return fields
     if isinstance(value, tuple):
         return [lean(each) for each in value]
@@ -370,7 +370,9 @@ def lean(value: Any) -> Any:
 
 
 @cache
-def _outline(kind: type[msgspec.Struct]) -> tuple[Any, tuple[tuple[str, Any], ...]]:
-    """Return the tag of records of *kind*, and their fields with their defaults."""
+def _outline(kind: type[msgspec.Struct]) -> tuple[Any, tuple[tuple[str, str, Any], ...]]:
+    """Return the tag of records of *kind*; of each field name, key in JSON and default."""
     fields = msgspec.structs.fields(kind)
-    return kind.__struct_config__.tag, tuple((field.name, field.default) for field in fields)
+    return kind.__struct_config__.tag, tuple(
+        (field.name, field.encode_name, field.default) for field in fields
+    )

@@ -14,11 +14,12 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from eap.ams.spec import HopSpec, RouteSpec, RoutingSpec, TransportKind
+from eap.ams.spec import AccessRule, AccessService, HopSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.config.load import load
 from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import read_back
 from eap.errors import ConfigError, EnvironmentalError
+from eap.ids import decode_value, encode_value
 from eap.pd.device import DeviceState
 from eap.pd.spec import RxAlternateSpec, SentVariableSpec
 from eap.runtime import store as module
@@ -35,6 +36,7 @@ from eap.runtime.store import (
     adopt_plant_file,
     digest_of,
     effective,
+    lean,
     plant_folder,
     state_root,
 )
@@ -500,3 +502,10 @@ def test_state_folder_of_the_version_before_is_taken_over(tmp_path, monkeypatch,
     assert routing.previous == plant.routing["saw"]
     assert routing.spec.access[0].networks == ("10.1.0.0/16",)
     assert not caplog.text
+
+
+def test_lean_routing_keeps_fields_with_another_name_in_json():
+    rule = AccessRule("local", services=(AccessService.WRITE,), transports=("ams-tcp",))
+    spec = RoutingSpec(access=(rule,))
+    plain = msgspec.to_builtins(lean(spec), enc_hook=encode_value)
+    assert msgspec.convert(plain, RoutingSpec, dec_hook=decode_value) == spec
