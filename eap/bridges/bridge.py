@@ -109,13 +109,30 @@ class Bridge:
         Raises:
             EapError: it is refused, or the appliance does not answer; the reason is for the client.
         """
-        station, _, variable = name.partition("/")
-        self.status.received += 1
+        await self.write_all({name: value}, transport=transport, host=host, user=user)
+
+    async def write_all(
+        self,
+        values: Mapping[str, Any],
+        *,
+        transport: Literal["mqtt", "opcua", "s7", "modbus"],
+        host: str,
+        user: str = "",
+    ) -> None:
+        """Write several variables as :meth:`write` does; those of one station all or none."""
+        by_station: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            station, _, variable = name.partition("/")
+            by_station.setdefault(station, {})[variable] = value
+        self.status.received += len(values)
         origin = WriteOrigin(user, host, transport=transport)
+        left = len(values)
         try:
-            await self._writer.call(WRITE, station=station, values={variable: value}, origin=origin)
+            for station, own in by_station.items():
+                await self._writer.call(WRITE, station=station, values=own, origin=origin)
+                left -= len(own)
         except EapError:
-            self.status.refused += 1
+            self.status.refused += left
             raise
 
     async def request(self, method: str) -> Any:
@@ -140,9 +157,13 @@ class Bridge:
             self._file.write(self.status)
             await self._writer.close()
 
+    def save(self) -> None:
+        """Write the status to its file now, after a change that users wait for."""
+        self._file.write(self.status)
+
     def _change(self, peer: str, reason: str, *, is_up: bool) -> None:
         status = self.status
         if (status.is_up, status.reason, status.peer) != (is_up, reason, peer):
             status.is_up, status.reason, status.peer = is_up, reason, peer
             status.since = time()
-            self._file.write(status)
+            self.save()

@@ -172,6 +172,10 @@ def _report(error: Exception) -> None:
 
 
 _COMMANDS = {
+    "addresses": (
+        "addresses:addresses",
+        "Show the addresses of variables in data blocks and registers.",
+    ),
     "apply": ("plant:apply", "Apply a plant file to the running plant."),
     "bus": ("bus:bus", "Scan, diagnose and access the slaves of a bus."),
     "check": ("plant:check", "Check a plant file and report all errors."),

@@ -34,7 +34,8 @@ from eap.config.structs import (
 from eap.ids import InterfaceUri, ObjectId
 from eap.od.model import RW, Access
 from eap.od.slave_config import OpMode, SlaveConfig
-from eap.pd.spec import BusEntrySpec, BusSlaveSpec, PortKind
+from eap.pd.fieldsources import controller_variables
+from eap.pd.spec import BusEntrySpec, BusSlaveSpec, FieldSource, PortKind
 
 FIRST_STATION = 1001
 """Station address of the first slave in the line; the others follow."""
@@ -292,6 +293,14 @@ class Index:
         self._bus_variables: dict[str, dict[str, BusVariable]] = {}
         for (name, _), bus in self.buses.items():
             self._bus_variables.setdefault(name, {}).update(bus.variables)
+        self._field_variables = {
+            station.name: controller_variables(
+                each.controller
+                for each in station.sources.values()
+                if isinstance(each, FieldSource)
+            )
+            for station in plant.stations
+        }
         self.stations = _first((s.name, s) for s in plant.stations)
         self.ports = _first(((s.name, p.name), p) for s in plant.stations for p in s.ports)
         self.frames = _first(((s.name, f.name), f) for s in plant.stations for f in s.frames)
@@ -341,6 +350,10 @@ class Index:
         """Return the variables that buses add to *station*."""
         return self._bus_variables.get(station.name, {})
 
+    def field_variables(self, station: StationSection) -> dict[str, tuple[str, str, str]]:
+        """Return type, unit and comment of the variables of the controllers that it reads."""
+        return self._field_variables.get(station.name, {})
+
     def unread_buses(self, station: StationSection) -> list[str]:
         """Return the bus ports of *station* without a readable description."""
         return [port for name, port in self._unread if name == station.name]
@@ -355,7 +368,7 @@ class Index:
         names = [*station.variables]
         for subscription in station.subscribe:
             names += self.received(subscription)
-        return [*names, *self.bus_variables(station)]
+        return [*names, *self.bus_variables(station), *self.field_variables(station)]
 
     def publishers(self, subscription: SubscribeSection) -> list[SentPd]:
         """Return the PDs of this plant that *subscription* receives; several only for any."""
@@ -389,6 +402,8 @@ class Index:
             return station.variables[name].type
         if name in (on_bus := self.bus_variables(station)):
             return on_bus[name].type
+        if name in (made := self.field_variables(station)):
+            return made[name][0]
         for subscription in station.subscribe:
             if subscription.variables is not None:
                 if name in subscription.variables:

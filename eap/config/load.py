@@ -8,6 +8,7 @@ about a sender that a subscriber needs.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ from eap.config.bus import (
 from eap.config.document import convert, read, read_net_id
 from eap.config.eoe import check_eoe, eoe_spec
 from eap.config.exchange import check_polls, check_publish, check_subscribe
+from eap.config.field import check_field, field_bridge_on, field_bridges, resolved_source
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.hosts import check_hosts, is_served_on
 from eap.config.index import Index, SentPd, VariablePart
@@ -86,11 +88,11 @@ from eap.pd.spec import (
     REQUESTER,
     BusPortSpec,
     CsvSource,
-    HostSource,
     LinkSpec,
     PortKind,
     PortSpec,
     RxPdSpec,
+    ServicesSource,
     Source,
     StationSpec,
     TxFrameSpec,
@@ -141,7 +143,8 @@ def _station(index: Index, station: StationSection, phase_us: int, folder: Path)
         ),
         phase_us=phase_us,
         variables=tuple(_variables(index, station)),
-        sources=tuple(_source(source, folder) for source in station.sources.values()),
+        sources=tuple(_source(index, source, folder) for source in station.sources.values()),
+        targets=tuple(station.targets.values()),
         frames=tuple(_frames(index, station)),
         subscriptions=tuple(_subscription(index, each) for each in station.subscribe),
         links=tuple(_links(index, station)),
@@ -156,7 +159,7 @@ def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
     for name, variable in station.variables.items():
         source = sources.get(name)
         writer = Writer.ENGINE if source is not None or name in linked else Writer.APPLICATION
-        if isinstance(source, HostSource | CsvSource):
+        if isinstance(source, ServicesSource):
             writer = Writer.SERVICES
         yield _variable(name, variable, writer)
     for subscription in station.subscribe:
@@ -170,6 +173,8 @@ def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
                 unit, comment = (original.unit, original.comment) if original else ("", "")
                 copy = VariableSection(type=text, unit=unit, comment=comment)
                 yield _variable(name, copy, Writer.ENGINE)
+    for name, (text, unit, comment) in index.field_variables(station).items():
+        yield VariableSpec(name, text, Writer.SERVICES, unit=unit, comment=comment)
     for name, on_bus in index.bus_variables(station).items():
         is_free = on_bus.is_output and name not in linked
         writer = Writer.APPLICATION if is_free else Writer.ENGINE
@@ -219,11 +224,11 @@ def _variable(name: str, variable: VariableSection, writer: Writer) -> VariableS
     )
 
 
-def _source(source: Source, folder: Path) -> Source:
+def _source(index: Index, source: Source, folder: Path) -> Source:
     # Relative to the plant file, and not to the working directory of services.
     if isinstance(source, CsvSource):
         return msgspec.structs.replace(source, file=str((folder / source.file).resolve()))
-    return source
+    return resolved_source(index, source)
 
 
 def _frames(index: Index, station: StationSection) -> Iterator[TxFrameSpec]:
@@ -509,7 +514,7 @@ class Plant(msgspec.Struct, frozen=True):
             metrics=metrics if metrics is None or is_served_on(host, metrics.listen) else None,
             record=tuple(each for each in self.record if records_of(each, host.stations)),
             bridges={
-                key: each
+                key: field_bridge_on(each, partial(is_served_on, host))
                 for key, each in self.bridges.items()
                 if not isinstance(each, OpcUaSection) or is_served_on(host, each.listen)
             },
@@ -523,7 +528,7 @@ def _bridges(index: Index, folder: Path) -> dict[str, msgspec.Struct]:
         found[mqtt.KEY] = mqtt_spec(index, mqtt, folder)
     if (opcua := index.plant.opcua) is not None:
         found[opcua.KEY] = resolved_opcua(opcua, folder)
-    return found
+    return found | field_bridges(index)
 
 
 class PlantResult(msgspec.Struct, frozen=True):
@@ -570,6 +575,7 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
     check_web(index, report, path.parent)
     check_mqtt(index, report, path.parent)
     check_opcua(index, report, path.parent)
+    check_field(index, report)
     check_hosts(index, report)
     check_recordings(index, report)
     # Derived only from a plant without findings, so nothing below can fail.

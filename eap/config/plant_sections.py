@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from eap.config.field_sections import ModbusSection, S7Section
 from eap.config.mqtt_sections import MqttSection
 from eap.config.opcua_sections import OpcUaSection
 from eap.config.record_sections import RecordSection
@@ -42,3 +43,5 @@ class PlantFile(Section, frozen=True, kw_only=True):
     record: tuple[RecordSection, ...] = ()
     mqtt: MqttSection | None = None
     opcua: OpcUaSection | None = None
+    s7: S7Section | None = None
+    modbus: ModbusSection | None = None

@@ -124,5 +124,7 @@ def reason_not_settable(index: Index, station: StationSection, name: str) -> str
         return "a link writes it"
     if (on_bus := index.bus_variables(station).get(variable)) is not None:
         return "" if on_bus.is_output else "it is an input of a bus"
+    if variable in index.field_variables(station):
+        return "it is the state of a controller"
     is_received = variable in names and variable not in station.variables
     return "it is received" if is_received else ""

@@ -21,6 +21,7 @@ from eap.pd.spec import (
     PortKind,
     Source,
     Substitute,
+    Target,
     TriggerSpec,
     TxFrameSpec,
     TxPdSpec,
@@ -474,6 +475,7 @@ class StationSection(Section, frozen=True):
     phase_us: Annotated[int, Meta(ge=0, le=60_000_000)] | None = None
     variables: dict[str, VariableSection] = {}
     sources: dict[str, Source] = {}
+    targets: dict[str, Target] = {}
     frames: tuple[FrameSection, ...] = ()
     publish: tuple[PublishSection, ...] = ()
     subscribe: tuple[SubscribeSection, ...] = ()

@@ -25,6 +25,7 @@ from eap.pd.spec import (
     Measure,
     RampSource,
     RandomSource,
+    ServicesSource,
     SineSource,
     Source,
 )
@@ -47,6 +48,7 @@ def check_variables(index: Index, report: FindingReport, folder: Path) -> None:
             if subscription.variables is None
             for name in index.received(subscription)
         ]
+        names += [(station.at, name) for name in index.field_variables(station)]
         names += [
             (port.at, name)
             for port in station.ports
@@ -162,7 +164,7 @@ def _check_shared_sources(index: Index, station: StationSection, report: Finding
         if part is None:
             continue
         span = part.span
-        by_services = isinstance(source, HostSource | CsvSource)
+        by_services = isinstance(source, ServicesSource)
         others = spans.setdefault(part.variable, [])
         for other, theirs, is_theirs in others:
             line = report.line_of(f"{station.at}.sources.{other}")
@@ -171,7 +173,7 @@ def _check_shared_sources(index: Index, station: StationSection, report: Finding
                 report.add(f"{station.at}.sources.{name}", message, "one source for each part")
             elif is_theirs is not by_services:
                 message = f"{part.variable!r} has sources of two kinds (also in line {line})"
-                expected = "only host and csv sources, or none of them, within one variable"
+                expected = "only host, csv, s7 and modbus sources, or none, within one variable"
                 report.add(f"{station.at}.sources.{name}", message, expected)
         others.append((name, span, by_services))
 

@@ -28,6 +28,7 @@ from eap.codec.pd import PdHeader
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.spec import (
     BusEntrySpec,
+    FieldSource,
     RxAlternateSpec,
     RxPdSpec,
     SpecRecord,
@@ -43,7 +44,7 @@ from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 # Header first, at fixed offsets: a program of another release finds the version, and stops, before
 # it relies on anything else.
 MAGIC = b"EAPIMAGE"
-LAYOUT_VERSION = 5
+LAYOUT_VERSION = 6
 HEADER = struct.Struct("<8sIIQQQ")
 """Magic, layout version, generation, offset and length of the directory, size of the file."""
 WORDS_OFFSET = 64
@@ -167,6 +168,19 @@ class RxSlot(SpecRecord, frozen=True):
     """Address that its frames must come from; empty takes any."""
 
 
+class FieldSlot(SpecRecord, frozen=True):
+    """A source in a controller: word *words* has the monotonic time of its newest value, 0 if none.
+
+    Services writes the word.
+    """
+
+    variable: str
+    """A variable, or a part of one."""
+    controller: str
+    timeout_ms: int
+    words: int
+
+
 class ImageLayout(SpecRecord, frozen=True):
     """The directory of one station's image."""
 
@@ -182,6 +196,7 @@ class ImageLayout(SpecRecord, frozen=True):
     samples: SampleSlot
     word_count: int
     directory_offset: int
+    fields: tuple[FieldSlot, ...] = ()
 
     def encode(self) -> bytes:
         """Return the directory as stored in the image."""
@@ -206,6 +221,11 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
     tx = tuple(_tx_slots(spec, frames, types, words))
     # In one piece, so that a slice with a stride reaches one word of all RxPDs.
     rx_words = [words.take(RxWord.SIZE) for _ in spec.subscriptions]
+    fields = tuple(
+        FieldSlot(each.variable, each.controller, each.timeout_ms, words.take(1))
+        for each in spec.sources
+        if isinstance(each, FieldSource)
+    )
 
     octets = _Allocator(WORDS_OFFSET + 8 * words.used)
     start = octets.used
@@ -244,6 +264,7 @@ def plan_layout(spec: StationSpec) -> ImageLayout:
         samples=samples,
         word_count=words.used,
         directory_offset=octets.used,
+        fields=fields,
     )
 
 

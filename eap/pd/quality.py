@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import TypeAlias
 
 from eap.codec.pd import PdHeader
 from eap.codec.structures import variable_of
 from eap.pd.image import Image
-from eap.pd.layout import ImageLayout, RxSlot
+from eap.pd.layout import FieldSlot, ImageLayout, RxSlot
 from eap.pd.spec import LinkSpec
 from eap.pd.words import RxWord, StationWord
 
@@ -23,8 +24,10 @@ QUALITY_NS = 100_000
 QUALITY_MAX = 0xFFFF
 """Largest quality: the data is older, or never came."""
 
-Origins: TypeAlias = Mapping[str, tuple[RxSlot, ...]]
-"""Subscriptions from which variables get their values, by the name of the variable."""
+Origin: TypeAlias = RxSlot | FieldSlot
+"""Subscription, or source in a controller."""
+Origins: TypeAlias = Mapping[str, tuple[Origin, ...]]
+"""Origins from which variables get their values, by the name of the variable."""
 
 NO_ORIGINS: Origins = MappingProxyType({})
 
@@ -57,22 +60,43 @@ def quality(image: Image, slot: RxSlot) -> int:
     return int(min(sent + own_ns // QUALITY_NS, QUALITY_MAX))
 
 
+def field_quality(image: Image, slot: FieldSlot) -> int:
+    """Return the age of a controller's value in units of 100 us at the last cycle, saturated."""
+    at_ns = image.words[slot.words]
+    if not at_ns:
+        return QUALITY_MAX
+    age_ns = image.words[StationWord.CYCLE_AT_NS] - at_ns
+    # Negative: it came after the last cycle.
+    return int(min(max(age_ns, 0) // QUALITY_NS, QUALITY_MAX))
+
+
+def is_late(image: Image, slot: FieldSlot) -> bool:
+    """Return whether a controller's value is older than its time-out at the last cycle."""
+    at_ns = image.words[slot.words]
+    age_ns = image.words[StationWord.CYCLE_AT_NS] - at_ns
+    return not at_ns or age_ns > slot.timeout_ms * 1_000_000
+
+
 class ForwardedQuality:
     """Quality of a sent PD with received values: the age of the oldest of them.
 
     Args:
         image: The station's process image.
-        slots: The subscriptions that the values come from.
+        slots: The origins of the values.
     """
 
-    def __init__(self, image: Image, slots: Sequence[RxSlot]) -> None:
-        self._image = image
-        self._slots = slots
+    def __init__(self, image: Image, slots: Sequence[Origin]) -> None:
+        self._ages = [
+            partial(field_quality, image, slot)
+            if isinstance(slot, FieldSlot)
+            else partial(quality, image, slot)
+            for slot in slots
+        ]
 
     def into(self, buffer: memoryview, offset: int) -> None:
         """Write it to the header of the PD whose data starts at *offset* of *buffer*."""
         # A PD header has one quality for all values of the PD.
-        oldest = max(quality(self._image, slot) for slot in self._slots)
+        oldest = max(age() for age in self._ages)
         _put_u16(buffer, offset - _QUALITY_SIZE, oldest)
 
 
@@ -85,12 +109,16 @@ def forwarded_quality(
 
 
 def find_origins(layout: ImageLayout, links: Iterable[LinkSpec]) -> Origins:
-    """Return the subscriptions from which each variable gets its value, directly or by links.
+    """Return the origins from which each variable gets its value, directly or by links.
 
     A link follows those that fill its source, so one pass in their order is enough.
     """
+    found: dict[str, tuple[Origin, ...]]
     found = {name: (slot,) for slot in layout.rx for name in slot.variables}
     names = {slot.name for slot in layout.variables}
+    for each in layout.fields:
+        variable = variable_of(each.variable, names)
+        found[variable] = (*found.get(variable, ()), each)
     for link in links:
         if came := found.get(variable_of(link.source, names)):
             # Several links may fill one target by bits or members.

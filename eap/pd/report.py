@@ -14,9 +14,9 @@ from eap.codec import datatypes
 from eap.pd.address import from_word, source_text
 from eap.pd.device import DeviceState
 from eap.pd.image import Image
-from eap.pd.layout import FrameSlot, RxSlot, TxSlot
+from eap.pd.layout import FieldSlot, FrameSlot, RxSlot, TxSlot
 from eap.pd.monitor import SubscriberPresence
-from eap.pd.quality import quality, tracker_word
+from eap.pd.quality import is_late, quality, tracker_word
 from eap.pd.words import (
     HISTOGRAM_BINS,
     PD_DROP_REASONS,
@@ -96,11 +96,32 @@ def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dic
             for p in layout.ports
         ],
         "discarded": _discarded(image, StationWord.DISCARDED),
+        **_controllers(image, now_ns),
         "frames": [frame_status(image, slot) for slot in layout.frames],
         "pd": {
             "tx": [tx_status(image, slot) for slot in layout.tx],
             "rx": [_rx(image, slot, now_ns, wall_ns) for slot in layout.rx],
         },
+    }
+
+
+def _controllers(image: Image, now_ns: int) -> dict[str, Any]:
+    """Return the controllers that the station reads, nothing if there are none."""
+    by_name: dict[str, list[FieldSlot]] = {}
+    for slot in image.layout.fields:
+        by_name.setdefault(slot.controller, []).append(slot)
+    if not by_name:
+        return {}
+    return {"controllers": [_controller(image, name, s, now_ns) for name, s in by_name.items()]}
+
+
+def _controller(image: Image, name: str, slots: list[FieldSlot], now_ns: int) -> dict[str, Any]:
+    moments = [image.words[slot.words] for slot in slots]
+    return {
+        "name": name,
+        "sources": len(slots),
+        "late": sum(is_late(image, slot) for slot in slots),
+        "age_us": max(now_ns - min(moments), 0) // 1000 if all(moments) else None,
     }
 
 

@@ -27,7 +27,7 @@ class Writer(StrEnum):
     ENGINE = "engine"
     """Received process data and the generators that run in the cycle."""
     SERVICES = "services"
-    """Sources that need I/O: host measurements, CSV replay."""
+    """Sources that need I/O: host measurements, CSV replay, controllers."""
     APPLICATION = "application"
     """User programs and ``eapctl pd set``."""
 
@@ -137,9 +137,56 @@ class CsvSource(SpecRecord, frozen=True, tag="csv", tag_field="kind"):
     period_ms: int = 100
 
 
+class S7Source(SpecRecord, frozen=True, tag="s7", tag_field="kind"):
+    """A value in a data block of a *controller*, which the bridge ``s7`` reads."""
+
+    variable: str
+    controller: str
+    address: str
+    type: str = ""
+    """Type there, if it is another one than that of the variable."""
+    timeout_ms: _U32 = 0
+    """Age at which the substitute applies; in a plant file 0 is that of the controller."""
+    substitute: Substitute | None = None
+    """In a plant file None is that of the controller."""
+
+
+class ModbusSource(SpecRecord, frozen=True, tag="modbus", tag_field="kind"):
+    """A value in registers of a *controller*, which the bridge ``modbus`` reads."""
+
+    variable: str
+    controller: str
+    address: str
+    type: str = ""
+    timeout_ms: _U32 = 0
+    substitute: Substitute | None = None
+
+
 EngineSource = CounterSource | RampSource | SineSource | RandomSource
-ServicesSource = HostSource | CsvSource
+FieldSource = S7Source | ModbusSource
+ServicesSource = HostSource | CsvSource | FieldSource
 Source = EngineSource | ServicesSource
+
+
+class S7Target(SpecRecord, frozen=True, tag="s7", tag_field="kind"):
+    """A place in a data block of a *controller* that the bridge ``s7`` writes a variable to."""
+
+    variable: str
+    controller: str
+    address: str
+    type: str = ""
+
+
+class ModbusTarget(SpecRecord, frozen=True, tag="modbus", tag_field="kind"):
+    """Registers of a *controller* that the bridge ``modbus`` writes a variable to."""
+
+    variable: str
+    controller: str
+    address: str
+    type: str = ""
+
+
+Target = S7Target | ModbusTarget
 
 
 class OnChangeSpec(SpecRecord, frozen=True):
@@ -471,6 +518,7 @@ class StationSpec(SpecRecord, frozen=True):
     """Offset of the station within its cycle; stations of one engine are staggered."""
     variables: tuple[VariableSpec, ...] = ()
     sources: tuple[Source, ...] = ()
+    targets: tuple[Target, ...] = ()
     frames: tuple[TxFrameSpec, ...] = ()
     subscriptions: tuple[RxPdSpec, ...] = ()
     links: tuple[LinkSpec, ...] = ()

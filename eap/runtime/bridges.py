@@ -15,6 +15,36 @@ import msgspec
 from eap.runtime.folder import ApplianceInfo
 
 
+class PeerStatus(msgspec.Struct, kw_only=True):
+    """State of one of several systems that a bridge connects to.
+
+    Attributes:
+        name: Its name in the plant file.
+        url: Its address.
+        is_up: True while it is connected.
+        reason: Why it is not, or why a value cannot be read or written.
+        since: Unix time of the latest change of *is_up*.
+        connects: Times that it was connected.
+        reads: Rounds in which all values were read.
+        writes: Values written.
+        values: Values that are read and written.
+        failed: Those of them that cannot be, for the *reason*.
+        span_us: Duration of the last round.
+    """
+
+    name: str
+    url: str = ""
+    is_up: bool = False
+    reason: str = ""
+    since: float = 0.0
+    connects: int = 0
+    reads: int = 0
+    writes: int = 0
+    values: int = 0
+    failed: int = 0
+    span_us: int = 0
+
+
 class BridgeStatus(msgspec.Struct, kw_only=True):
     """Present state of a bridge, and its counters since the process began.
 
@@ -29,6 +59,7 @@ class BridgeStatus(msgspec.Struct, kw_only=True):
         received: Writes that clients requested.
         refused: Those of them that were not done.
         dropped: Values and requests that it left out because the other side was too slow.
+        peers: Systems that it connects to, if there are several.
     """
 
     pid: int = 0
@@ -41,6 +72,7 @@ class BridgeStatus(msgspec.Struct, kw_only=True):
     received: int = 0
     refused: int = 0
     dropped: int = 0
+    peers: list[PeerStatus] = []
 
 
 _DECODER = msgspec.json.Decoder(BridgeStatus)
@@ -88,6 +120,15 @@ def _findings(where: str, status: BridgeStatus) -> list[dict[str, Any]]:
         what = f"no connection to {status.peer}: {status.reason}"
         advice = "the plant runs without it; it tries again by itself"
         rows.append(_row("warning", where, what, advice, status.since))
+    for peer in status.peers:
+        at = f"{where} {peer.name}"
+        if not peer.is_up and peer.reason:
+            what = f"no connection to {peer.url}: {peer.reason}"
+            advice = "its variables have their substitutes; it tries again by itself"
+            rows.append(_row("warning", at, what, advice, peer.since))
+        elif peer.failed:
+            what = f"{peer.failed} of {peer.values} values fail: {peer.reason}"
+            rows.append(_row("warning", at, what, "correct the address in the plant file", None))
     if status.dropped:
         what = f"{status.dropped} values dropped: {status.peer} is too slow"
         rows.append(_row("info", where, what, "", None))

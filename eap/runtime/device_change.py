@@ -29,6 +29,7 @@ from eap.pd.spec import (
     PortKind,
     Source,
     StationSpec,
+    Target,
     VariableSpec,
 )
 from eap.runtime.bus_change import describe_bus_changes
@@ -174,6 +175,7 @@ def describe_rest(old: StationSpec, new: StationSpec) -> list[str]:
         *describe_bus_changes(old, new),
         *_gateway_changes(old, new),
         *_differences("source of", _source_name, old.sources, new.sources),
+        *_differences("target of", _source_name, old.targets, new.targets),
         *_differences("link", _link_name, old.links, new.links),
         *_differences("variable", _variable_name, _chosen(old, on_bus), _chosen(new, on_bus)),
     ]
@@ -202,7 +204,7 @@ def _chosen(spec: StationSpec, names: set[str]) -> tuple[VariableSpec, ...]:
     return tuple(each for each in spec.variables if each.name in names)
 
 
-def _source_name(source: Source) -> str:
+def _source_name(source: Source | Target) -> str:
     return source.variable
 
 

@@ -50,6 +50,7 @@ from eap.services.control.bus_methods import Buses, GatewayMethods, bus_reports
 from eap.services.control.control_ads import ControlAds, RemoteControl
 from eap.services.control.control_server import ControlServer
 from eap.services.control.device_methods import DeviceMethods
+from eap.services.control.field_methods import FieldMethods
 from eap.services.control.methods import Methods
 from eap.services.control.route_methods import AmsMethods, RouteMethods, RoutingMethods
 from eap.services.control.status import (
@@ -58,6 +59,7 @@ from eap.services.control.status import (
     appliance_status,
     take_snapshot,
 )
+from eap.services.device.field_player import FieldPlayer, controller_findings
 from eap.services.device.image_values import ImageValues
 from eap.services.device.monitoring import ProbeSockets, SubscriberWatch
 from eap.services.device.sources import SourcePlayer
@@ -138,6 +140,7 @@ class StationDevices:
         self.specs: dict[str, StationSpec] = {}
         self.ads: dict[str, StationAds] = {}
         self._players: list[SourcePlayer] = []
+        self.fields: dict[str, FieldPlayer] = {}
         self._release = release
         self._images = images
         self._has_restarted = asyncio.Event()
@@ -161,6 +164,8 @@ class StationDevices:
                 group.create_task(ads.serve())
             for player in self._players:
                 group.create_task(player.serve())
+            for field in self.fields.values():
+                group.create_task(field.serve())
             group.create_task(self._follow_restarts())
 
     def engine_has_restarted(self) -> None:
@@ -179,6 +184,8 @@ class StationDevices:
             self._has_restarted.set()  # the previous services process may have ended in a change
         player = SourcePlayer(station, image)
         keeper.on_change.append(player.change)
+        self.fields[name] = field = FieldPlayer(station, image)
+        keeper.on_change.append(field.change)
         self.keepers[name] = keeper
         self.specs[name] = station
         keeper.on_change.append(partial(self.specs.__setitem__, name))
@@ -413,7 +420,7 @@ class Services:
             reports = await bus_reports(buses.clients, STATUS_TIMEOUT_S)
             info = self._folder.read_info()
             bridges = read_bridges(self._folder.path, info)
-            return appliance_status(
+            document = appliance_status(
                 info,
                 [await take_snapshot(each.image) for each in images.values()],
                 (engine.stats(), self._counters.stats()),
@@ -421,7 +428,8 @@ class Services:
                 reports,
                 self._listeners.stats(),
                 bridges,
-            ) | {
+            )
+            return document | {
                 "audit": audit.report(),
                 **({"host": hosts.own, "hosts": hosts.report()} if hosts.own else {}),
                 "findings": [
@@ -431,6 +439,7 @@ class Services:
                     *(row for each in devices.by_station.values() for row in each.findings()),
                     *recording_findings(self._handover.plant, time()),
                     *bridge_findings(self._handover.plant, bridges),
+                    *controller_findings(document["stations"]),
                 ],
             }
 
@@ -461,6 +470,7 @@ class Services:
             **DeviceMethods(devices.by_station, routers, plant_file, deny_control).table(),
             **RouteMethods(views, self._directory).table(),
             **RoutingMethods(devices.routing).table(),
+            **FieldMethods(devices.fields).table(),
             **AmsMethods(
                 devices.routers, self._directory, sockets.ams_address, deny_control
             ).table(),

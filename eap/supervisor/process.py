@@ -12,10 +12,8 @@ import select
 import signal
 from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
-from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic_ns
-from typing import NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -23,7 +21,7 @@ from msgspec.structs import replace
 from eap.ams.spec import RoutingSpec
 from eap.config.load import Plant
 from eap.errors import ConfigError, EnvironmentalError
-from eap.ids import InterfaceUri, encode_value
+from eap.ids import InterfaceUri
 from eap.net.loopback import LoopbackLines
 from eap.net.realtime import raise_descriptor_limit
 from eap.pd.device import DeviceState
@@ -36,19 +34,17 @@ from eap.runtime.busfile import load_or_raise
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
 from eap.runtime.handover import (
     NO_DESCRIPTOR,
-    BridgeHandover,
     BusSocket,
     EngineOptions,
     Handover,
     InheritedRecord,
-    RecorderHandover,
     SegmentHandover,
-    WebHandover,
 )
 from eap.runtime.socket_plan import require_own_buses
 from eap.runtime.startup import catch_end_signals
 from eap.runtime.store import StationStore, adopt_plant_file, effective
 from eap.supervisor.child import Child, OutputHandler, StartEvent, describe_end
+from eap.supervisor.optional import missing_extra, optional_processes
 from eap.supervisor.part import load_part
 from eap.supervisor.sockets import (
     SharedSockets,
@@ -61,30 +57,6 @@ GRACE_NS = 1_000_000_000
 """Time for a process to end after SIGTERM; the whole appliance has two seconds."""
 _EXTRA_PAUSE_NS = 500_000_000
 """Shortest pause before an optional process is started again."""
-
-
-class _Extra(NamedTuple):
-    """Optional process.
-
-    Attributes:
-        module: Has its ``main``.
-        needs: Module that must be installed.
-        extra: Extra that installs it.
-    """
-
-    module: str
-    needs: str
-    extra: str
-
-
-_EXTRAS = {
-    "web": _Extra("eap.web.process", "aiohttp", "web"),
-    "metrics": _Extra("eap.web.process", "aiohttp", "web"),
-    "recording": _Extra("eap.recording.process", "mcap", "record"),
-    "mqtt": _Extra("eap.bridges.mqtt.process", "aiomqtt", "mqtt"),
-    "opcua": _Extra("eap.bridges.opcua.process", "asyncua", "opcua"),
-}
-"""Optional processes by their keys in the plant file."""
 SEGMENT_GRACE_NS = 500_000_000
 """The same for simulated segments, which end after the others."""
 
@@ -231,7 +203,7 @@ class Supervisor:
             host=info.host,
             hosts=plant.hosts,
         )
-        self._extras |= _optional_processes(plant, folder, self._bytecode)
+        self._extras |= optional_processes(plant, folder, self._bytecode)
         self._sockets = sockets
         self._common = common
         self._given = {
@@ -456,10 +428,9 @@ class Supervisor:
 
     def _start_extra(self, child: Child) -> None:
         self._restart_ns.pop(child, None)
-        _, needs, extra = _EXTRAS[_kind_of(child.name)]
-        if find_spec(needs) is None:
+        if fault := missing_extra(child.name):
             # Only another installation changes this: without a restart it is not tried again.
-            child.fault = f"{needs} is not installed: pip install 'eap-appliance[{extra}]'"
+            child.fault = fault
             logger.warning("%s does not run: %s", child.name, child.fault)
             self._write_info()
             return
@@ -578,33 +549,6 @@ def make_info(plant: str, plant_file: str, stations: Sequence[StationSpec]) -> A
 
 def _process_info(child: Child) -> ProcessInfo:
     return ProcessInfo(child.pid, child.restarts, child.report, child.watch.step, child.fault)
-
-
-def _optional_processes(
-    plant: Plant, folder: ApplianceFolder, bytecode: str
-) -> dict[Child, InheritedRecord]:
-    """Return the processes that the plant file asks for and the plant does not need."""
-    own = os.getpid()
-    handovers: dict[str, InheritedRecord] = {}
-    if plant.web is not None:
-        handovers["web"] = WebHandover(own, plant.name, web=plant.web)
-    if plant.metrics is not None:
-        handovers["metrics"] = WebHandover(own, plant.name, metrics=plant.metrics)
-    for name, section in plant.bridges.items():
-        raw = msgspec.Raw(msgspec.json.encode(section, enc_hook=encode_value))
-        handovers[name] = BridgeHandover(own, str(folder.path), plant.name, name, raw)
-    for record in plant.record:
-        handover = RecorderHandover(own, str(folder.path), plant.name, record)
-        handovers[f"recording {record.name}"] = handover
-    return {
-        Child(name, _EXTRAS[_kind_of(name)].module, bytecode): each
-        for name, each in handovers.items()
-    }
-
-
-def _kind_of(process: str) -> str:
-    """Return the kind of an optional process, of which there may be several."""
-    return process.partition(" ")[0]
 
 
 def _own_routing(plant: Plant) -> dict[str, RoutingSpec]:

@@ -90,6 +90,12 @@ class Shell:
             )
             return done.stdout
 
+    def end_first(self) -> None:
+        """End the command that was started first behind &."""
+        process = self._running.pop(0)
+        process.terminate()
+        process.communicate(timeout=20)
+
     def close(self) -> None:
         """End what runs."""
         for process in self._running:

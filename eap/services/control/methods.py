@@ -23,7 +23,7 @@ from eap.errors import ControlError, ImageError, WriterConflictError
 from eap.net.image_file import StationImage
 from eap.pd.image import Image
 from eap.pd.layout import VariableSlot
-from eap.pd.quality import quality, tracker_word
+from eap.pd.quality import field_quality, is_late, quality, tracker_word
 from eap.pd.report import PdRow, pd_list
 from eap.pd.spec import Writer
 from eap.pd.words import RxState, RxWord, StationWord
@@ -240,6 +240,14 @@ def _qualities(
             qualities.update((name, value) for name in received)
             if is_stale:
                 stale += received
+    for field in image.layout.fields:
+        age = field_quality(image, field) if image.words[field.words] else None
+        # A variable with several sources is as old as the oldest of them.
+        for name in parts.get(variable_of(field.variable, image.slots), ()):
+            before = qualities.get(name, 0)
+            qualities[name] = None if age is None or before is None else max(before, age)
+            if is_late(image, field) and name not in stale:
+                stale.append(name)
     return qualities, tuple(stale)
 
 

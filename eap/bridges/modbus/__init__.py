@@ -1,0 +1,1 @@
+"""The bridge ``modbus``: registers of Modbus devices, and registers that are served."""

@@ -1,0 +1,1 @@
+"""The bridge ``s7``: data blocks of S7 controllers, and data blocks that are served."""
