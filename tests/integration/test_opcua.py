@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import re
+import signal
+import socket
+import struct
+import subprocess
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -14,7 +19,8 @@ from typing import Any
 import pytest
 
 from eap.config.passwords import PasswordHash
-from tests.support.appliance import Appliance, Plants, plants, wait_until
+from tests.support.appliance import Appliance, Plants, plants, run_eapctl, wait_until
+from tests.support.npm import needs_npm, node_environment
 
 pytestmark = [
     pytest.mark.net,
@@ -27,9 +33,12 @@ URL, CLOSED_URL = "opc.tcp://127.0.0.1:4840", "opc.tcp://127.0.0.1:4841"
 HASH = str(PasswordHash.of("secret", bytes(16)))
 PLANT = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[0].replace("scrypt$32768$8$1$…$…", HASH)
 # Changed for tests alone: what a client may not do, and values that are not received.
+SOURCES = re.findall(r"    sources: .*\n", PLANT)[0]
 PRESS = PLANT.replace(
-    "opcua:\n",
+    f"{SOURCES}opcua:\n",
     """\
+      big: BLOCK(60000)
+    sources: {speed: {kind: sine, offset: 50, amplitude: 5, period_ms: 5000}}
     subscribe:
       - name: far
         port: eap0
@@ -236,3 +245,253 @@ def test_wrong_password_and_channel_without_security_are_refused(press):
     assert refusal(nothing, "nobody") == "BadUserAccessDenied"
     assert refusal(nothing, "anna", password="wrong") == "BadUserAccessDenied"
     assert refusal(nothing, "anna", CLOSED_URL) == "BadSecurityPolicyRejected"
+
+
+PEER = r"""
+const o = require("node-opcua");
+const dynamic = require("node-opcua-client-dynamic-extension-object");
+const [url, policy, user, password] = process.argv.slice(1);
+const say = (what) => console.log(JSON.stringify(what));
+const value = (name) => ({ nodeId: "ns=2;s=press/" + name, attributeId: o.AttributeIds.Value });
+const told = () => new Promise((done) => process.stdin.once("data", done));
+async function connect() {
+  const client = o.OPCUAClient.create({
+    securityPolicy: o.SecurityPolicy[policy], securityMode: o.MessageSecurityMode.SignAndEncrypt,
+    connectionStrategy: { maxRetry: 0 }, endpointMustExist: false, keepSessionAlive: false,
+  });
+  await client.connect(url);
+  return client;
+}
+(async () => {
+  try { await connect(); say("connected"); } catch (error) { say("refused"); }
+  await told();
+  const client = await connect();
+  const login = { type: o.UserTokenType.UserName, userName: user };
+  try { await client.createSession({ ...login, password: "wrong" }); }
+  catch (error) { say(error.message.match(/Bad\w+/)[0]); }
+  const session = await client.createSession({ ...login, password });
+  const browsed = await session.browse("ns=2;s=press");
+  say(browsed.references.map((each) => each.browseName.name));
+  const speed = await session.read(value("speed"));
+  say([o.DataType[speed.value.dataType], speed.statusCode.name, speed.sourceTimestamp.getTime()]);
+  const types = await dynamic.getExtraDataTypeManager(session);
+  const axis = await session.read(value("axis"));
+  await dynamic.resolveDynamicExtensionObject(session, axis.value, types);
+  say(axis.value.value);
+  const write = async (name, dataType, what) => {
+    const value_ = { value: { dataType, value: what } };
+    say((await session.write({ ...value(name), value: value_ })).name);
+  };
+  axis.value.value.position = 9.25;
+  await write("axis", o.DataType.ExtensionObject, axis.value.value);
+  say((await session.read(value("axis.position"))).value.value);
+  await write("setpoint", o.DataType.UInt16, 66);
+  await write("speed", o.DataType.Double, 66);
+  await write("setpoint", o.DataType.String, "x");
+  const subscription = await session.createSubscription2({
+    requestedPublishingInterval: 50, requestedLifetimeCount: 100,
+    requestedMaxKeepAliveCount: 10, publishingEnabled: true,
+  });
+  const changes = [];
+  const item = await subscription.monitor(
+    value("speed"), { samplingInterval: 50, queueSize: 10, discardOldest: true },
+    o.TimestampsToReturn.Both);
+  await new Promise((done) => item.on("changed", (one) => {
+    if (changes.push(one.value.value) == 3) done();
+  }));
+  say(new Set(changes).size);
+  const state = { objectId: "ns=2;s=press", methodId: "ns=2;s=press#RequestState" };
+  const inputArguments = [{ dataType: o.DataType.Int32, value: 8 }];
+  const called = await session.call({ ...state, inputArguments });
+  say(called.statusCode.name);
+  await subscription.terminate();
+  await session.close();
+  await client.disconnect();
+  process.exit(0);
+})().catch((error) => { console.error(error); process.exit(1); });
+"""
+
+
+@needs_npm("node-opcua")
+def test_node_opcua_uses_a_signed_and_encrypted_channel_with_a_user(press, tmp_path):
+    folder = Path(press.status()["audit"]["file"]).parent / "opcua"
+    peer = subprocess.Popen(
+        ["node", "-e", PEER, "--", URL, "Aes256_Sha256_RsaPss", "otto", "secret"],
+        env=node_environment() | {"HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with peer:
+        try:
+            assert peer.stdin is not None
+            said = spoken(peer)
+            assert next(said) == "refused"
+            (rejected,) = (folder / "rejected").glob("*.der")
+            rejected.rename(folder / "trusted" / rejected.name)
+            peer.stdin.write("go\n")
+            peer.stdin.flush()
+            assert next(said) == "BadUserAccessDenied"
+            assert {"state", "speed", "axis", "bus0"} <= set(next(said))
+            kind, status, at_ms = next(said)
+            assert (kind, status) == ("Double", "Good")
+            assert at_ms > 1.79e12
+            axis = next(said)
+            assert list(axis) == ["position", "state", "moved", "path"]
+            assert [list(each) for each in axis["path"]] == [["x", "y"]] * 2
+            assert [next(said), next(said)] == ["Good", 9.25]
+            assert [next(said) for _ in range(3)] == ["Good", "BadNotWritable", "BadTypeMismatch"]
+            assert next(said) == 3
+            assert next(said) == "Good"
+            assert peer.wait(20) == 0
+        finally:
+            peer.kill()
+    assert press.values("press")["setpoint"] == 66
+    assert press.values("press")["axis"]["position"] == 9.25
+
+
+def spoken(peer: subprocess.Popen[str]) -> Iterator[Any]:
+    """Yield what a peer says; other lines are of its library."""
+    assert peer.stdout is not None
+    for line in peer.stdout:
+        with suppress(json.JSONDecodeError):
+            yield json.loads(line)
+
+
+def test_nodes_follow_a_changed_configuration_while_clients_are_connected(press, folder):
+    """Nodes come, go and change; monitored items of those that stay go on."""
+    changed = PRESS.replace("limit: UINT", "limit: LREAL\n      added: UINT").replace(
+        '      curve: "REAL[4]"\n', ""
+    )
+
+    async def follow(client: Any) -> None:
+        told = Told()
+        subscription = await client.create_subscription(50, told)
+        for name in ("limit", "curve", "speed"):
+            await subscription.subscribe_data_change(node(client, f"press/{name}"))
+        await subscription.subscribe_events(evtypes=2132)  # BaseModelChangeEventType
+        await told.until(lambda: len(told.values) >= 3)
+        done = await asyncio.to_thread(
+            run_eapctl, press.runtime, "apply", str(folder.write(changed, "changed.yaml"))
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        await told.until(lambda: told.last("press/curve") == "BadNodeIdUnknown" and told.events)
+        assert (await node(client, "press/added").read_value()) == 0
+        await told.until(lambda: told.last("press/limit") == 0.0)
+        limit = await node(client, "press/limit").read_data_type()
+        assert limit.Identifier == 11
+        count = len(told.values)
+        await told.until(lambda: len(told.values) > count)
+        with pytest.raises(Exception, match="BadNodeIdUnknown"):
+            await node(client, "press/curve").read_value()
+        done = await asyncio.to_thread(
+            run_eapctl, press.runtime, "rollback", str(folder.folder / "changed.yaml")
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    in_session(follow)
+
+
+class Told:
+    """Handler of a subscription: names with their latest values, or bad status, and events."""
+
+    def __init__(self) -> None:
+        self.values: list[tuple[str, Any]] = []
+        self.events: list[Any] = []
+        self._news = asyncio.Event()
+
+    def datachange_notification(self, one: Any, value: Any, data: Any) -> None:
+        status = data.monitored_item.Value.StatusCode
+        what = value if status is None or not status.is_bad() else status.name
+        self.values.append((one.nodeid.Identifier, what))
+        self._news.set()
+
+    def event_notification(self, event: Any) -> None:
+        self.events.append(event)
+        self._news.set()
+
+    def last(self, name: str) -> Any:
+        return next((value for each, value in reversed(self.values) if each == name), None)
+
+    async def until(self, condition: Callable[[], object]) -> None:
+        while not condition():
+            self._news.clear()
+            await self._news.wait()
+
+
+def test_server_goes_on_with_many_clients_and_without_some(press):
+    """100 sessions; some break off, and one sends requests without reading answers."""
+
+    async def crowd() -> None:
+        from asyncua import Client
+
+        clients = [Client(URL, timeout=60) for _ in range(100)]
+        try:
+            async with asyncio.TaskGroup() as group:
+                for each in clients:
+                    group.create_task(each.connect())
+            async with asyncio.TaskGroup() as group:
+                reads = [group.create_task(node(c, "press/speed").read_value()) for c in clients]
+            assert all(45 <= each.result() <= 55 for each in reads)
+            wait_until(lambda: bridge_of(press)["clients"] == 100)
+            for each in clients[:50]:
+                each.uaclient.protocol.transport.abort()
+            read = await node(clients[-1], "press/speed").read_value()
+            assert 45 <= read <= 55
+        finally:
+            async with asyncio.TaskGroup() as group:
+                for each in clients[50:]:
+                    group.create_task(each.disconnect())
+        wait_until(lambda: bridge_of(press)["clients"] == 0)
+
+    asyncio.run(crowd())
+
+
+def test_client_that_reads_no_answers_is_disconnected(press):
+    async def flood() -> None:
+        async with asyncio.timeout(90), connected() as client:
+            transport = client.uaclient.protocol.transport
+            transport.pause_reading()
+            big = node(client, "press/big").nodeid
+            async with asyncio.TaskGroup() as group:
+                for _ in range(40):
+                    group.create_task(unanswered(client.uaclient.read_attributes([big] * 10, 13)))
+                await asyncio.to_thread(wait_until, lambda: bridge_of(press)["dropped"] == 1)
+                transport.resume_reading()
+
+    async def unanswered(answer: Any) -> None:
+        with suppress(Exception):
+            await answer
+
+    with suppress(Exception):  # of the closed session
+        asyncio.run(flood())
+    assert bridge_of(press)["dropped"] == 1
+    in_session(lambda client: node(client, "press/speed").read_value())
+
+
+def test_plant_that_restarts_leaves_sessions_and_values_go_on(press):
+    async def survive(client: Any) -> None:
+        told = Told()
+        subscription = await client.create_subscription(50, told)
+        await subscription.subscribe_data_change(node(client, "press/speed"))
+        await told.until(lambda: told.values)
+        os.kill(press.pid("services"), signal.SIGKILL)
+        count = len(told.values)
+        await told.until(lambda: len(told.values) > count + 5)
+        await told.until(lambda: isinstance(told.last("press/speed"), float))
+        read = await node(client, "press/speed").read_data_value(raise_on_bad_status=False)
+        while not read.StatusCode.is_good():
+            read = await node(client, "press/speed").read_data_value(raise_on_bad_status=False)
+
+    in_session(survive)
+
+
+def test_garbage_is_refused_and_the_server_goes_on(press):
+    for garbage in (b"GET / HTTP/1.1\r\n\r\n", b"HELF" + struct.pack("<I", 0xFFFFFFFF) + bytes(64)):
+        with socket.create_connection(("127.0.0.1", 4840), timeout=20) as peer:
+            peer.sendall(garbage)
+            peer.shutdown(socket.SHUT_WR)
+            while peer.recv(4096):
+                pass
+    in_session(lambda client: node(client, "press/speed").read_value())
