@@ -21,7 +21,7 @@ from eap.errors import ControlError
 from eap.ids import encode_value
 from eap.release import RELEASE
 from eap.web.feed import UNKNOWN, PlantFeed, Shown
-from eap.web.guard import TOKEN, USER, Guard, needs_user, read_json, refusal
+from eap.web.guard import TOKEN, USER, Guard, is_browser, needs_user, read_json, refusal
 from eap.web.openapi import DOCUMENT
 from eap.web.rules import SetRules
 from eap.web.topics import PageTopics
@@ -300,6 +300,10 @@ class Api:
             await self._feed.write(station, variable, body["value"], origin)
         except (ControlError, BusError) as exc:
             return _failure(exc)
+        # A program may write all the time, and would leave no other event in the log.
+        if is_browser(request):
+            self._feed.note_write(name, body["value"], origin)
+            self._topics.send_events()
         return answer({"written": name, "value": body["value"]})
 
 

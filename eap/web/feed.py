@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import aclosing
 from itertools import islice
-from time import monotonic
+from time import monotonic, time
 from typing import Any, NamedTuple
 
 import msgspec
@@ -32,7 +32,7 @@ from eap.control.routes import ROUTES_LIST, RouterRow
 from eap.errors import ControlError, EapError
 from eap.live.client import LiveClient
 from eap.live.events import LiveEvent
-from eap.live.findings import is_hung
+from eap.live.findings import Severity, is_hung
 from eap.live.rows import pd_flows, station_rows
 from eap.live.transport import ValuesSubscription
 from eap.live.view import LiveReport, LiveView
@@ -47,6 +47,8 @@ _DIRECTORY_S = 10.0
 _STALE_AFTER_S = 2.0
 """Beyond its period, a value of a station that runs no cycle, or does not answer, is stale."""
 _KEPT_EVENTS = 200
+_SHOWN_VALUE = 40
+"""Characters of a value in an event."""
 
 logger = logging.getLogger(__name__)
 
@@ -252,6 +254,16 @@ class PlantFeed:
         """Write a variable of the application; raise ControlError if that is refused."""
         client = self._client_of(station)
         await client.call(WRITE, station=station, values={variable: value}, origin=origin)
+
+    def note_write(self, name: str, value: Any, origin: WriteOrigin) -> None:
+        """Add a value that a user has set to the events."""
+        text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
+        what = f"set to {text[:_SHOWN_VALUE]} {self.unit_of(name)}".rstrip()
+        what += f" by {origin.user or origin.host}"
+        if origin.comment:
+            what += f": {origin.comment}"
+        events = self._view.log.events
+        events.append(LiveEvent(time(), Severity.INFO, self.plant, name, what))
 
     async def routes(self, station: str) -> list[RouterRow]:
         """Return the routes of a station; raise ControlError if it does not answer."""

@@ -150,8 +150,7 @@ class Guard:
             return answer
         if request.content_type != "application/json":
             return refusal(415, "expected Content-Type: application/json")
-        is_browser = "Origin" in request.headers or "Sec-Fetch-Site" in request.headers
-        if is_browser or request.get(TOKEN):
+        if is_browser(request):
             given = request.headers.get(CSRF_HEADER, "").encode("utf-8", "replace")
             if not hmac.compare_digest(given, self.csrf(request).encode()):
                 return refusal(403, f"header {CSRF_HEADER} is missing or old: reload the page")
@@ -278,6 +277,12 @@ class Guard:
                 return refusal(503, "too many logins at once", **{"Retry-After": wait})
             case LoginFailure.WRONG:
                 return refusal(401, "unknown user or wrong password")
+
+
+def is_browser(request: web.Request) -> bool:
+    """Return whether a browser sent a request, and no program."""
+    headers = request.headers
+    return "Origin" in headers or "Sec-Fetch-Site" in headers or bool(request.get(TOKEN))
 
 
 def needs_user(request: web.Request) -> Principal:

@@ -169,12 +169,15 @@ class PageTopics:
 
     def status_changed(self) -> None:
         """Send overview and events after a status report."""
-        for name in (PLANT, EVENTS):
-            if (topic := self._topics.get(name)) is None:
-                continue
-            part = TopicPart(name, SLOW_MS)
-            if name == PLANT or (self._feed.report is not None and self._feed.report.events):
-                self._send(topic, part)
+        if (topic := self._topics.get(PLANT)) is not None:
+            self._send(topic, TopicPart(PLANT, SLOW_MS))
+        if self._feed.report is not None and self._feed.report.events:
+            self.send_events()
+
+    def send_events(self) -> None:
+        """Send the events after there are new ones."""
+        if (topic := self._topics.get(EVENTS)) is not None:
+            self._send(topic, TopicPart(EVENTS, SLOW_MS))
 
     def _send(self, topic: _Topic, part: TopicPart) -> None:
         message = topic.latest[part] = self._encode(topic, part)

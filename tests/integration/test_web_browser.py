@@ -298,6 +298,12 @@ def test_operator_sets_a_set_point_and_logs_out(tab: Callable[..., Tab], plant: 
     panel.get_by_role("button", name="Set", exact=True).click()
     panel.get_by_text("✓ Set: 80 1/min").wait_for()
 
+    page = one.open("events/")
+    page.locator(".panel-events td", has_text="set to 80 1/min by otto").wait_for()
+    page.get_by_label("Least severity").select_option("error")
+    page.locator(".panel-events td", has_text="by otto").wait_for(state="detached")
+
+    page = one.open("page/Line")
     page.get_by_role("button", name="Log out").click()
     panel.get_by_text("yours is viewer").wait_for()
 

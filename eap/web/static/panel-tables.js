@@ -17,9 +17,11 @@ export function eventsPanel(panel, scope) {
   const { frame, body } = table(t("events"), [t("time"), t("severity"), t("where"), t("event")], { class: "events" });
   const rows = new Rows(body);
   const none = h("p", { class: "note" }, t("no_events"));
-  const least = LEVELS.indexOf(panel.from);
-  scope.on("events", ({ events }) => {
-    const fitting = events.filter((each) => LEVELS.indexOf(each.severity) >= least && matchesAny(panel.of, each.where.split("/")[0]));
+  const choice = h("select", { class: "tool", "aria-label": t("events_from") }, LEVELS.map((each) => h("option", { value: each, selected: each === panel.from }, `${tn("severity", each)}`)));
+  let latest = [];
+  const show = () => {
+    const least = LEVELS.indexOf(choice.value);
+    const fitting = latest.filter((each) => LEVELS.indexOf(each.severity) >= least && matchesAny(panel.of, each.where.split("/")[0]));
     const shown = fitting.slice(-panel.rows).reverse();
     none.hidden = shown.length > 0;
     frame.hidden = !shown.length;
@@ -27,8 +29,13 @@ export function eventsPanel(panel, scope) {
       formatTime(event.time), severityCell(event.severity), event.where,
       event.advice ? `${event.what}; ${event.advice}` : event.what,
     ]);
+  };
+  choice.addEventListener("change", show);
+  scope.on("events", ({ events }) => {
+    latest = events;
+    show();
   });
-  return h("div", {}, none, frame);
+  return { element: h("div", {}, none, frame), tools: [choice] };
 }
 
 /** Return what tells one event from another. */

@@ -23,7 +23,7 @@ export function trendPanel(panel, scope) {
   const names = resolve(panel.of, app.variables, app.stations);
   if (!names.length) return { element: h("p", { class: "note" }, t("no_variables")) };
   const position = new Map(names.map((name, index) => [name, index]));
-  const plotFrame = h("div", { class: "plot", tabindex: "0", role: "slider", "aria-label": t("trend_of", { names: names.join(", "), window: panel.window }) });
+  const plotFrame = h("div", { class: "plot", tabindex: "0", role: "slider", "aria-valuemin": "0", "aria-valuemax": "100", "aria-valuenow": "100", "aria-label": t("trend_of", { names: names.join(", "), window: panel.window }) });
   const legend = h("ul", { class: "legend" });
   const cursorTime = legend.appendChild(h("li", { class: "at", hidden: true }));
   const readings = names.map((name, index) => legendItem(name, index, panel, scope, legend));
@@ -109,6 +109,7 @@ export function trendPanel(panel, scope) {
     if (plot && moveCursor(plot, event, { range, zoom, follow })) {
       event.preventDefault();
       const texts = readings.map((read, index) => `${names[index]} ${read.text()}`);
+      setAttribute(plotFrame, "aria-valuenow", Math.round((100 * plot.cursor.left) / plot.over.clientWidth));
       setAttribute(plotFrame, "aria-valuetext", [cursorTime.textContent, ...texts].join("; "));
     }
   });

@@ -180,6 +180,25 @@ def test_write_without_users_sets_within_the_limits_of_the_panel():
     play(script)
 
 
+def test_value_that_a_browser_sets_is_an_event():
+    async def script(found: Site) -> None:
+        browser, headers = await found.log_in("otto")
+        socket = await subscribed(browser, "events")
+        body = {"value": 45, "comment": "new recipe"}
+        await browser.post(SETPOINT, json=body, headers=headers)
+        while not (events := (await of_type(socket, "events"))["events"]):
+            pass
+        event = events[-1]
+        assert (event["severity"], event["where"]) == ("info", "mixer/setpoint")
+        assert event["what"] == "set to 45 1/min by otto: new recipe"
+        program = await found.client()
+        await program.post(SETPOINT, json={"value": 46}, headers=basic("elsa", PASSWORD))
+        events = (await (await browser.get("/api/v1/events")).json())["events"]
+        assert sum(each["where"] == "mixer/setpoint" for each in events) == 1
+
+    play(script, CLOSED)
+
+
 def test_write_of_nan_is_refused():
     async def script(found: Site) -> None:
         client = await found.client()
