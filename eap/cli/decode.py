@@ -148,7 +148,13 @@ def _cycle(frame: DecodedFrame) -> str:
 
 
 def _parts(frame: DecodedFrame) -> Iterator[str]:
+    from eap.pd.authentication import read_signature
+
     for pd in frame.pds or ():
+        if signature := read_signature(pd.id, pd.version, bytes.fromhex(pd.data)):
+            at = datetime.fromtimestamp(signature.counter / 1e9, UTC)
+            yield f"PD {pd.id}: signature by key {signature.key}, made {at:%Y-%m-%d %H:%M:%S.%f}"
+            continue
         yield (
             f"PD {pd.id} (0x{pd.id:04x})  version {pd.version}  "
             f"quality {pd.quality / 10:g} ms  {_octets(pd.data)}"

@@ -187,6 +187,7 @@ _COMMANDS = {
     "gw": ("gateway:gw", "Access a master and its slaves through any mailbox gateway."),
     "import": ("files:import_files", "Make a plant file of TwinCAT, ENI and ESI files."),
     "inventory": ("inventory:inventory", "Print the hosts of a plant file for Ansible."),
+    "keys": ("keys:keys", "Make and change keys of signed process data."),
     "new": ("plant:new", "Write a plant file to start from."),
     "od": ("od:od", "Read and write the object dictionary of a device."),
     "pd": ("pd:pd", "List, watch and set the process data of running stations."),

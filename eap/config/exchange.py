@@ -33,8 +33,9 @@ from eap.config.structs import (
 from eap.ids import NetId
 from eap.pd import rules
 from eap.pd.address import is_group_source, source_octets
+from eap.pd.authentication import SIGNED_BYTES
 from eap.pd.device import FaultCode
-from eap.pd.spec import REQUESTER
+from eap.pd.spec import REQUESTER, Authentication
 from eap.suggest import suggest
 
 
@@ -48,7 +49,23 @@ def check_publish(index: Index, report: FindingReport) -> None:
             _check_frame(index, report, station, frame)
         for pd in station.publish:
             _check_pd(index, report, station, pd)
+        _check_keys(index, report, station)
     _check_ids(index, report)
+
+
+def _check_keys(index: Index, report: FindingReport, station: StationSection) -> None:
+    """Report what needs keys where the station has none."""
+    if index.pd_keys(station):
+        return
+    expected = "pd_keys of the station, a file of 'eapctl keys new', or of defaults"
+    for frame in station.frames:
+        if frame.sign:
+            message = f"frame {frame.name!r} is signed, but {station.name} has no keys"
+            report.add(f"{frame.at}.sign", message, expected)
+    for subscription in station.subscribe:
+        if subscription.auth is not Authentication.OFF:
+            message = f"{subscription.name!r} looks at signatures, but {station.name} has no keys"
+            report.add(f"{subscription.at}.auth", message, expected)
 
 
 def check_port_reference(
@@ -88,7 +105,7 @@ def _check_frame(
         return
     check_net_id_destination(index, report, (station, frame), destination)
     check_frame_monitoring(report, frame, destination, uri)
-    size = FIRST_PD
+    size = FIRST_PD + (SIGNED_BYTES if frame.sign else 0)
     for pd in pds:
         sent = index.sent.get((station.name, pd.name))
         kinds = index.types(sent) if sent else None
@@ -351,7 +368,11 @@ def _check_numbers(
     report: FindingReport, subscription: SubscribeSection, source: FromSection
 ) -> None:
     path = f"{subscription.at}.from"
-    if source.publisher != "any":
+    if source.publisher == "any":
+        if subscription.auth is not Authentication.OFF:
+            message = f"{subscription.name!r} looks at signatures of any publisher"
+            report.add(f"{subscription.at}.auth", message, "one publisher: each counts by itself")
+    else:
         try:
             NetId.parse(source.publisher)
         except ValueError as exc:
@@ -381,6 +402,11 @@ def _check_match(
         message = f"version {subscription.version} of {subscription.name!r}, but {label} has "
         message += f"{sent.pd.version} (line {line})"
         report.add(f"{at}.version", message, f"{sent.pd.version}, or ignore_version: true")
+    if subscription.auth is not Authentication.OFF and not sent.frame.sign:
+        line = report.line_of(sent.frame.at)
+        message = f"{subscription.name!r} looks at the signature of {label}, but frame "
+        message += f"{sent.frame.name!r} (line {line}) has none"
+        report.add(f"{at}.auth", message, "sign: true at the frame, or auth: off")
     theirs = index.types(sent)
     if not subscription.variables or theirs is None:
         return

@@ -333,6 +333,10 @@ class Index:
         """Return the device cycle of *station*."""
         return station.cycle_us or self.plant.defaults.cycle_us
 
+    def pd_keys(self, station: StationSection) -> str:
+        """Return the file with the keys of *station*, relative to the plant file; empty if none."""
+        return station.pd_keys or self.plant.defaults.pd_keys
+
     def _sent(self) -> Iterator[SentPd]:
         for station in self.plant.stations:
             for pd in station.publish:

@@ -55,6 +55,7 @@ from eap.config.links import check_links, ends, execution_order, is_bitwise
 from eap.config.mqtt import check_mqtt, mqtt_spec, warn_of_commands
 from eap.config.opcua import check_opcua, resolved_opcua, warn_of_open_channels
 from eap.config.opcua_sections import OpcUaSection
+from eap.config.pd_keys import check_key_files
 from eap.config.plant_sections import HostSection, PlantFile
 from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
 from eap.config.record import check_recordings, records_of, resolved_recordings
@@ -148,7 +149,13 @@ def _station(index: Index, station: StationSection, phase_us: int, folder: Path)
         frames=tuple(_frames(index, station)),
         subscriptions=tuple(_subscription(index, each) for each in station.subscribe),
         links=tuple(_links(index, station)),
+        pd_keys=_path(folder, index.pd_keys(station)),
     )
+
+
+def _path(folder: Path, name: str) -> str:
+    """Return a file of the plant file by its whole path; empty stays so."""
+    return str((folder / name).resolve()) if name else ""
 
 
 def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
@@ -280,6 +287,7 @@ def _subscription(index: Index, subscription: SubscribeSection) -> RxPdSpec:
         poll_request=subscription.poll,
         changeable=subscription.changeable,
         source=_sender_address(index, subscription, publishers),
+        auth=subscription.auth,
     )
 
 
@@ -576,6 +584,7 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
     check_mqtt(index, report, path.parent)
     check_opcua(index, report, path.parent)
     check_field(index, report)
+    check_key_files(index, report, path.parent)
     check_hosts(index, report)
     check_recordings(index, report)
     # Derived only from a plant without findings, so nothing below can fail.

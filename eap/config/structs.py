@@ -15,6 +15,7 @@ from msgspec import Meta
 from eap.ids import NetId
 from eap.od.slave_config import RevisionRule, StateTimeouts, Watchdogs
 from eap.pd.spec import (
+    Authentication,
     BusTarget,
     LengthCheck,
     OnChangeSpec,
@@ -290,6 +291,7 @@ class FrameSection(Section, frozen=True):
     modulo: U16 | None = None
     monitor_interval_ms: Milliseconds = 0
     monitor_ip: str = ""
+    sign: bool = False
     changeable: bool = False
 
     def spec(self, destination: str, pds: tuple[TxPdSpec, ...] = (), mac: str = "") -> TxFrameSpec:
@@ -305,6 +307,7 @@ class FrameSection(Section, frozen=True):
             mac=mac,
             monitor_interval_ms=self.monitor_interval_ms,
             monitor_ip=self.monitor_ip,
+            sign=self.sign,
         )
 
 
@@ -373,6 +376,7 @@ class SubscribeSection(Section, frozen=True):
     changeable: bool = False
     sender: str = msgspec.field(default="", name="source")
     """Required source address of the frames, or ANY_SOURCE; by default that of the publisher."""
+    auth: Authentication = Authentication.OFF
 
 
 class LinkSection(Section, frozen=True):
@@ -484,6 +488,7 @@ class StationSection(Section, frozen=True):
     learn: bool | tuple[str, ...] = True
     access: tuple[AccessSection, ...] = ()
     users: tuple[UserSection, ...] = ()
+    pd_keys: str = ""
 
     @property
     def eap_ports(self) -> list[str]:
@@ -495,6 +500,7 @@ class Defaults(Section, frozen=True):
     """Defaults of stations."""
 
     cycle_us: DeviceCycle = 10_000
+    pd_keys: str = ""
 
 
 class AuditMode(StrEnum):

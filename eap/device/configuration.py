@@ -29,7 +29,7 @@ from eap.od.profiles import eap1000 as profile
 from eap.od.profiles.eap1000 import FrameSub, Rx, Tx, Var
 from eap.od.profiles.table import CONFIG, Form, ProfileObject, to_text
 
-VERSION = 1
+VERSION = 2
 
 Configuration: TypeAlias = dict[int, dict[int, bytes]]
 """Bytes of all entries that are kept, by index and sub-index."""

@@ -35,6 +35,7 @@ from eap.od.profiles.table import (
     make_entry,
     make_object,
 )
+from eap.pd.authentication import SIGNED_BYTES
 from eap.pd.device import DeviceFault
 from eap.pd.rules import data_budget, frame_budget
 from eap.pd.spec import PortSpec, StationSpec
@@ -269,7 +270,8 @@ class EapDictionary(ObjectDictionary):
     def frame_length(self, index: int) -> int:
         """Return the size of the frame at *index* in bytes, with all existing PDs that it lists."""
         listed = [pd for _, pd in self.listed_pds(index) if pd in self]
-        return FIRST_PD + sum(PdHeader.SIZE + self.pdo_length(pd) for pd in listed)
+        signature = SIGNED_BYTES if self[index].entries[FrameSub.SIGN].value else 0
+        return FIRST_PD + sum(PdHeader.SIZE + self.pdo_length(pd) for pd in listed) + signature
 
     def listed_pds(self, index: int) -> Iterator[tuple[int, int]]:
         """Yield sub-index and TxPD of the list of the frame at *index*, without its blanks."""

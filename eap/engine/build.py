@@ -17,6 +17,7 @@ from eap.engine.frame_taps import FrameRecording
 from eap.engine.rebuild import EngineStation, StationRebuilder
 from eap.net.framering_file import FrameRingFile
 from eap.net.image_file import create_image
+from eap.pd.authentication import KeyRing
 from eap.pd.engine import Engine
 from eap.pd.image import Image
 from eap.pd.layout import plan_layout
@@ -64,7 +65,7 @@ class EnginePlant:
         for spec in handover.stations:
             step(f"building station {spec.name}")
             file = create_image(folder.image(spec.name), plan_layout(spec))
-            station = Station(spec, file.image, file.wake_waiters)
+            station = Station(spec, file.image, file.wake_waiters, KeyRing())
             self._stations[spec.name] = EngineStation(station, file, self._channels)
         step("opening ports")
         for shared in handover.sockets:
@@ -115,6 +116,11 @@ class EnginePlant:
     def image(self, station: str) -> Image:
         """Return the process image of a station as it is now."""
         return self._stations[station].file.image
+
+    def look_at_keys(self) -> None:
+        """Take the keys of files that have changed, and follow the clock of the host."""
+        for entry in self._stations.values():
+            entry.look_at_keys()
 
     def publish_discards(self) -> None:
         """Add the frames that the interfaces dropped since the last call to the counters."""

@@ -147,6 +147,7 @@ def run_cycles(
             if now_ns >= look_ns:
                 look_ns = now_ns + LOOK_PERIOD_NS
                 plant.publish_discards()
+                plant.look_at_keys()
                 plant.buses.publish()
                 plant.recording.look(now_ns)
                 # Automatic collection is off; this is between two cycles.

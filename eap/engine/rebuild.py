@@ -22,6 +22,7 @@ from eap.engine.bus_settings import epoch_offset_ns, master_settings
 from eap.engine.channels import PortChannels, engine_sockets, has_tcp
 from eap.engine.engine_bus import BusSuccessor, EngineBus
 from eap.engine.engine_buses import EngineBuses
+from eap.engine.key_files import KeyFile
 from eap.errors import EapError, EngineRefusedError
 from eap.net import realtime
 from eap.net.image_file import ImageFile, prepare_image
@@ -38,6 +39,7 @@ from eap.pd.handover import (
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, StationSpec, record_from_lines
 from eap.pd.station import Station
+from eap.pd.words import StationWord
 from eap.runtime.engine_messages import Configure, SetState, StationRequest
 from eap.runtime.handover import PortName, SharedSocket
 from eap.runtime.socket_plan import bus_of
@@ -52,6 +54,20 @@ class EngineStation:
         self.channels = channels
         self.buses: dict[str, EngineBus] = {}
         """By port."""
+        self.key_file = KeyFile(station.spec.name, station.spec.pd_keys)
+        self.follow_keys()
+
+    def look_at_keys(self) -> None:
+        """Follow the file of keys if it has changed, and the clock of the host."""
+        self.key_file.look()
+        self.follow_keys()
+
+    def follow_keys(self) -> None:
+        """Sign and check with the keys of the present file from now on."""
+        ring = self.station.keys
+        ring.keys = self.key_file.keys
+        ring.epoch_offset_ns = epoch_offset_ns()
+        self.file.image.words[StationWord.SIGNING_KEY] = ring.keys.signing
 
     def open_ports(self) -> None:
         """Open and connect all EAP ports, before the station starts."""
@@ -91,7 +107,12 @@ class StationReplacement:
             # Before Station(): its subscribers read from the words which trackers they share.
             self._images.carry_words()
             self._images.carry_values(before.inputs.memory)
-            self._station = station = Station(spec, image, self._file.wake_waiters)
+            # The ring stays: its counter must rise over the change.
+            keys = before.keys
+            self._station = station = Station(spec, image, self._file.wake_waiters, keys)
+            self._key_file = entry.key_file
+            if spec.pd_keys != before.spec.pd_keys:
+                self._key_file = KeyFile(spec.name, spec.pd_keys)
             self._opened = [
                 entry.channels.open(spec, port, station.handlers[port.name])
                 for port in self._changes.added
@@ -164,7 +185,8 @@ class StationReplacement:
         self._file.release()
         entry.file.wake_waiters()
         entry.file.close()
-        entry.file, entry.station = self._file, station
+        entry.file, entry.station, entry.key_file = self._file, station, self._key_file
+        entry.follow_keys()
         gone = [bus for bus in entry.buses.values() if bus not in self._connected]
         if gone or self._added_buses:
             self._buses.exchange(entry, gone, self._added_buses, now_ns)

@@ -465,12 +465,17 @@ def _of_sources(station: Row) -> Iterator[StatusFinding]:
 
 
 _WRONG_LENGTH = "wrong_length"
+_NOT_AUTHENTIC = ("unsigned", "bad_tag", "replayed")
+"""Reasons for which frames are dropped, or only counted, as the subscription says."""
 
 
 def _dropped(counts: Row) -> Iterator[str]:
     """Yield what was dropped, and what was taken though its frame was not right."""
-    if dropped := _counts({why: n for why, n in counts.items() if why != _WRONG_LENGTH}):
+    apart = {_WRONG_LENGTH, *_NOT_AUTHENTIC}
+    if dropped := _counts({why: n for why, n in counts.items() if why not in apart}):
         yield f"dropped: {dropped}"
+    if forged := _counts({why: counts.get(why, 0) for why in _NOT_AUTHENTIC}):
+        yield f"not authentic: {forged}"
     if taken := counts.get(_WRONG_LENGTH):
         yield f"taken in spite of a wrong frame length: {taken}"
 

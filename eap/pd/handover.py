@@ -53,6 +53,7 @@ _SOURCE_WORDS = (
     RxWord.OTHER_SOURCE_AT_NS,
     RxWord.WRONG_SOURCE,
     RxWord.WRONG_SOURCE_AT_NS,
+    RxWord.SIGNED,
 )
 
 
@@ -257,6 +258,7 @@ def _tracker_key(slot: RxSlot) -> tuple[object, ...]:
         slot.sender_cycle_us,
         slot.timeout_ms,
         slot.poll_request,
+        slot.auth,
     )
 
 

@@ -27,6 +27,7 @@ from eap.codec.datatypes import DataType, Plain
 from eap.codec.pd import PdHeader
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.spec import (
+    Authentication,
     BusEntrySpec,
     FieldSource,
     RxAlternateSpec,
@@ -166,6 +167,7 @@ class RxSlot(SpecRecord, frozen=True):
     alternates: tuple[AlternateSlot, ...] = ()
     source: str = ""
     """Address that its frames must come from; empty takes any."""
+    auth: Authentication = Authentication.OFF
 
 
 class FieldSlot(SpecRecord, frozen=True):
@@ -416,6 +418,7 @@ def _rx_slots(
             poll_request=pd.poll_request,
             alternates=lay_out_alternates(pd, kinds, bits, offset),
             source=pd.source,
+            auth=pd.auth,
         )
 
 

@@ -43,13 +43,17 @@ class OutFrame:
 
     Attributes:
         oversized: Whether a channel could not send it last because it is too large for its wire.
+        signature: Offset of its signature's data behind the headroom; 0 if it is not signed.
     """
 
-    __slots__ = ("buffer", "destination", "headroom", "oversized", "view")
+    __slots__ = ("buffer", "destination", "headroom", "oversized", "signature", "view")
 
-    def __init__(self, buffer: bytearray, headroom: int, destination: str) -> None:
+    def __init__(
+        self, buffer: bytearray, headroom: int, destination: str, signature: int = 0
+    ) -> None:
         self.buffer = buffer
         self.headroom = headroom
+        self.signature = signature
         self.destination = destination
         self.view = memoryview(buffer)
         self.oversized = False

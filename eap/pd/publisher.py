@@ -125,7 +125,7 @@ class Publisher:
             net_id = net_id_of(destination)
             if net_id is not None:  # what an earlier engine learned will do until it is heard anew
                 destination = str(from_word(self._words[slot.words + FrameWord.ADDRESS]) or "")
-            frame = TxFrame(slot, publisher, pds, gate, channel, destination)
+            frame = TxFrame(slot, publisher, pds, gate, channel, destination, is_signed=spec.sign)
             self.frames.append(frame)
             self._note_target(frame, net_id)
         self._controls: dict[str, int] = {}
@@ -316,9 +316,10 @@ _POLL = REASON_INDEX[Reason.POLL]
 class _ResponseFrame:
     """The polled PDs of one TxFrame, and a buffer for each requester."""
 
-    def __init__(self, slot: FrameSlot, pds: tuple[TxPd, ...]) -> None:
+    def __init__(self, slot: FrameSlot, pds: tuple[TxPd, ...], *, is_signed: bool) -> None:
         self.slot = slot
         self.pds = pds
+        self._is_signed = is_signed
         self.suppressed = False
         self._kept: dict[tuple[str, tuple[TxPd, ...]], Selection] = {}
 
@@ -332,7 +333,8 @@ class _ResponseFrame:
             if len(kept) >= ANSWERS_KEPT:
                 # The oldest goes; requesters may forge addresses, so the table has to stay bounded.
                 del kept[next(iter(kept))]
-            selection = Selection(build_frame(publisher, pds, channel, sender), pds)
+            out = build_frame(publisher, pds, channel, sender, is_signed=self._is_signed)
+            selection = Selection(out, pds)
             kept[sender, pds] = selection
         return selection
 
@@ -379,6 +381,7 @@ class PollResponder:
                     )
                     for pd, where in zip(spec.pds, slots, strict=True)
                 ),
+                is_signed=spec.sign,
             )
             for spec, slot, slots in frames
         ]

@@ -89,6 +89,7 @@ def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dic
         "overruns": words[StationWord.OVERRUNS],
         "restarts": words[StationWord.RESTARTS],
         "torn": words[StationWord.TORN],
+        "signing_key": words[StationWord.SIGNING_KEY] or None,
         "links_held": words[StationWord.LINKS_HELD],
         "lateness_us": _spread(lateness, words[StationWord.LATENESS_MAX_NS] // 1000),
         "ports": [

@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeVar
 from eap.codec.ethercat import MAX_ETHERNET_FRAME, MAX_UDP_FRAME, EtherCatHeader
 from eap.codec.pd import FIRST_PD, PdHeader
 from eap.ids import Destination, DestinationKind, InterfaceUri, MacAddr
+from eap.pd.authentication import SIGNATURE_ID
 from eap.pd.device import FaultCode
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL
 from eap.pd.spec import REQUESTER, TxFrameSpec, TxPdSpec
@@ -113,6 +114,7 @@ def check_frame(frame: TxFrameSpec, modulo: int | None) -> Iterator[RuleViolatio
     """
     yield from check_modulo(frame.name, frame.divider, modulo)
     yield from check_answers(frame)
+    yield from check_signed(frame)
 
 
 def check_pd(pd: TxPdSpec, modulo: int | None) -> Iterator[RuleViolation]:
@@ -142,6 +144,14 @@ def check_answers(frame: TxFrameSpec) -> Iterator[RuleViolation]:
         message = f"frame {frame.name!r} carries answers and has a divider"
         expected = "none: an answer leaves in the cycle that the request is taken in"
         yield RuleViolation(FaultCode.TRIGGERS, "divider", message, expected)
+
+
+def check_signed(frame: TxFrameSpec) -> Iterator[RuleViolation]:
+    """A signed frame has no other PD with the ID of its signature."""
+    if frame.sign and any(pd.pd_id == SIGNATURE_ID for pd in frame.pds):
+        message = f"frame {frame.name!r} is signed and carries a PD with id {SIGNATURE_ID}"
+        expected = f"another id: the signature is PD {SIGNATURE_ID}"
+        yield RuleViolation(FaultCode.PD_ID_TWICE, "sign", message, expected)
 
 
 def check_frame_of(pd: TxPdSpec, frame: TxFrameSpec, line: str = "") -> Iterator[RuleViolation]:

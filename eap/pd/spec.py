@@ -249,6 +249,8 @@ class TxFrameSpec(SpecRecord, frozen=True):
     """Interval of looking for the host at a unicast destination; 0 never."""
     monitor_ip: str = ""
     """Ethernet: IPv4 address of the subscriber, to probe for by ARP; empty leaves it unknown."""
+    sign: bool = False
+    """True if a last PD signs it with a key of the station."""
 
 
 class SentVariableSpec(SpecRecord, frozen=True):
@@ -267,6 +269,17 @@ class RxAlternateSpec(SpecRecord, frozen=True):
     version: int
     variables: tuple[SentVariableSpec, ...]
     """Everything that is sent, in PDO order."""
+
+
+class Authentication(StrEnum):
+    """Treatment of the signature of frames with a PD."""
+
+    OFF = "off"
+    """It is not looked at."""
+    COUNT = "count"
+    """The data is taken; what is wrong is counted."""
+    REQUIRED = "required"
+    """Only data of a frame with a right signature is taken."""
 
 
 class RxPdSpec(SpecRecord, frozen=True):
@@ -299,6 +312,7 @@ class RxPdSpec(SpecRecord, frozen=True):
     source: str = ""
     """Address that its frames must come from, the publisher's: a MAC address on Ethernet, else an
     IPv4 address; empty takes frames from any."""
+    auth: Authentication = Authentication.OFF
 
 
 class PortKind(StrEnum):
@@ -522,6 +536,8 @@ class StationSpec(SpecRecord, frozen=True):
     frames: tuple[TxFrameSpec, ...] = ()
     subscriptions: tuple[RxPdSpec, ...] = ()
     links: tuple[LinkSpec, ...] = ()
+    pd_keys: str = ""
+    """File with the keys that sign its frames, and those of others; empty without."""
 
 
 # A call into msgspec holds the interpreter until it is done, which is milliseconds for thousands of

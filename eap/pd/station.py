@@ -18,6 +18,7 @@ from typing import NamedTuple
 import msgspec
 
 from eap.pd.address import NetIdLearner, forget
+from eap.pd.authentication import KeyRing, SigningChannel
 from eap.pd.device import DeviceState, EapDevice
 from eap.pd.image import Image, Inputs, Sampler
 from eap.pd.link import CyclicBus, FrameChannel, FrameHandler, PortTap, StateChannel
@@ -26,7 +27,7 @@ from eap.pd.poll import outgoing_polls, requests_at
 from eap.pd.publisher import FrameRow, PollResponder, Publisher
 from eap.pd.quality import find_origins
 from eap.pd.spec import EngineSource, LengthCheck, PortKind, StationSpec, Writer
-from eap.pd.subscriber import Subscriber
+from eap.pd.subscriber import NO_KEYS, Subscriber
 from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
 
 _CYCLE = int(StationWord.CYCLE)
@@ -65,14 +66,18 @@ class Station:
         spec: The checked specification.
         image: Its process image, fresh or left by an earlier engine of the same layout.
         wake: Wakes the programs that wait for the next cycle.
+        keys: Keys of signed frames.
 
     Attributes:
         buses: Those that take part in its cycle.
         handlers: Handlers of received frames, by port.
     """
 
-    def __init__(self, spec: StationSpec, image: Image, wake: Callable[[], None]) -> None:
+    def __init__(
+        self, spec: StationSpec, image: Image, wake: Callable[[], None], keys: KeyRing = NO_KEYS
+    ) -> None:
         self.spec = spec
+        self.keys = keys
         self.image = image
         self.cycle_ns = spec.cycle_us * 1000
         self.step_ns = self.cycle_ns
@@ -129,7 +134,13 @@ class Station:
         own = [(pd, slot) for pd, slot in rows if pd.port == port]
         lenient = any(p.name == port and p.length is LengthCheck.LENIENT for p in self.spec.ports)
         return Subscriber(
-            self.image, own, self.cycle_ns, self._requests[port], self._polls, lenient=lenient
+            self.image,
+            own,
+            self.cycle_ns,
+            self._requests[port],
+            self._polls,
+            lenient=lenient,
+            keys=self.keys,
         )
 
     def connect(
@@ -154,7 +165,11 @@ class Station:
             self._drain(group)
         own = next(p for p in self.spec.ports if p.name == port)
         net_id = own.net_id
-        out = StateChannel(channel, self._words) if own.eap_sm else channel
+        out: FrameChannel = channel
+        if any(frame.sign for frame, _, _ in frames):
+            out = SigningChannel(out, self.keys)
+        if own.eap_sm:
+            out = StateChannel(out, self._words)
         publisher = None
         if pushed := _pds_of(frames, polled=False):
             publisher = Publisher(self.image, self._inputs, net_id, out, pushed, self._origins)

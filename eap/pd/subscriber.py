@@ -9,23 +9,32 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
+from typing import NamedTuple, TypeAlias
 
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import CYCLE_OFFSET, EAP_SM_OFFSET, FIRST_PD, PD_FRAME_START, PdHeader
 from eap.ids import NetId
 from eap.pd.address import SourceWatch
+from eap.pd.authentication import (
+    SIGNATURE_FAULTS,
+    KeyRing,
+    SignatureCheck,
+    find_signature,
+    is_signature,
+)
 from eap.pd.image import Image
 from eap.pd.layout import RxSlot
 from eap.pd.link import FrameOrigin
 from eap.pd.poll import OutgoingPoll, PollRequests
 from eap.pd.sequence import SequenceTracker, Timing
-from eap.pd.spec import RxPdSpec
+from eap.pd.spec import Authentication, RxPdSpec
 from eap.pd.subscription import (
     AcceptedPd,
     DroppedPd,
     FrameHead,
     FramePlan,
     RxSubscription,
+    Signature,
     SubstituteValue,
     walk,
     walk_by_pds,
@@ -45,6 +54,7 @@ _PDS_PLANNED = 16384
 _PLANS_PER_KEY = 16
 """Limit of layouts with one key, which are tried in turn; beyond it all are learned again."""
 _NEVER = 1 << 62
+NO_KEYS = KeyRing()
 
 _CYCLE = int(StationWord.CYCLE)
 _SEQUENCE = int(StationWord.ENGINE_SEQUENCE)
@@ -63,6 +73,7 @@ class Subscriber:
         requests: Table for the requests of others.
         polls: The station's own polls, by the TxPD that sends them.
         lenient: Whether frames with a wrong Length are taken.
+        keys: Keys of the station, for signed frames.
     """
 
     def __init__(
@@ -74,9 +85,10 @@ class Subscriber:
         polls: Mapping[str, OutgoingPoll] = MappingProxyType({}),
         *,
         lenient: bool = False,
+        keys: KeyRing = NO_KEYS,
     ) -> None:
         self._table = SubscriptionTable(
-            image, subscriptions, own_cycle_ns, requests, polls, lenient=lenient
+            image, subscriptions, own_cycle_ns, requests, polls, lenient=lenient, keys=keys
         )
         self._open_from_ns = _NEVER
         self._closed_reason = PdDropReason.SUPPRESSED
@@ -130,8 +142,8 @@ class Subscriber:
         if at_ns < self._open_from_ns:
             table.discard(self._closed_reason, len(plan.expected), plan.accepted_words)
             return
-        for tracker in plan.any_publisher:
-            tracker.follow(plan.publisher)
+        if plan.has_checks:
+            plan = plan.admit(data)
         words, memory = table.words, table.memory
         # A frame taken outside the station's own cycle has to mark the region as changing itself.
         outside = not words[_SEQUENCE] & 1
@@ -197,6 +209,21 @@ class Subscriber:
         self._next_timeout_ns = following
 
 
+ChosenPd: TypeAlias = tuple[RxSubscription, PdHeader, int]
+"""A subscription that accepts a PD of a frame, and the PD's header with its offset."""
+
+
+class _LearnedLayout(NamedTuple):
+    """A layout of frames and what becomes of its PDs; see :class:`FramePlan`."""
+
+    head: FrameHead
+    end: int
+    pds: list[tuple[bytes, int]]
+    chosen: list[ChosenPd]
+    refused: list[DroppedPd]
+    watch: SourceWatch
+
+
 class SubscriptionTable:
     """The subscriptions of a port in one image, and the plans of the frames that come for them.
 
@@ -218,9 +245,11 @@ class SubscriptionTable:
         polls: Mapping[str, OutgoingPoll],
         *,
         lenient: bool = False,
+        keys: KeyRing = NO_KEYS,
     ) -> None:
         self._requests = requests
         self._lenient = lenient
+        self._keys = keys
         self.memory = image.memory
         self.words = image.words
         self.subscriptions = [
@@ -285,45 +314,86 @@ class SubscriptionTable:
         if not pds:
             return None  # nothing to take: what is kept is bounded by the PDs of all layouts
         publisher = bytes(data[PD_FRAME_START : PD_FRAME_START + 6])
-        chosen: list[tuple[RxSubscription, PdHeader, int]] = []
-        refused = []
-        for header, offset in pds:
-            match = self._match(publisher, header, source)
-            if isinstance(match, DroppedPd):
-                refused.append(match)
-            else:
-                chosen += [(subscription, header, offset) for subscription in match]
+        chosen, refused = self._choose(publisher, pds, source)
         taking = [subscription for subscription, _, _ in chosen]
         head = FrameHead(publisher, EtherCatHeader.decode(data).length, data[EAP_SM_OFFSET])
         end = PD_FRAME_START + head.length
         if is_wrong:
             end = pds[-1][1] + PdHeader.SIZE + pds[-1][0].length
-            refused.append(_wrong_length(taking))
+            refused.append(_taken_though(PdDropReason.WRONG_LENGTH, taking))
         if self._part_trackers(set(taking)):
             # Plans hold trackers, so those made before the split are no longer valid.
             self._forget_plans()
-        plan = FramePlan(
+        layout = _LearnedLayout(
             head,
             end,
             [(bytes(data[offset : offset + 6]), header.length) for header, offset in pds],
-            [_take(subscription, header, offset) for subscription, header, offset in chosen],
+            chosen,
             refused,
-            watch=self._watch(publisher, source, at_ns, taking, refused),
-            requests=[
-                (s.tracker, s.slot.name) for s in taking if s.slot.name in self._requests.names
-            ],
-            answers=[(s.tracker, s.answer) for s in taking if s.answer is not None],
-            any_publisher={s.tracker for s in taking if not s.slot.publisher},
+            self._watch(publisher, source, at_ns, taking, refused),
         )
+        plan = self._plan_checked(layout, find_signature(pds))
         if self._pds_planned > _PDS_PLANNED:
             self._forget_plans()
-        self._pds_planned += 1 + len(pds)
+        self._pds_planned += (1 + len(pds)) * plan.alternatives
         same_key = self._plans.setdefault(_KEY(data), [])
         # Bounded: a sender could otherwise fill the memory with invented layouts.
         if len(same_key) >= _PLANS_PER_KEY:
             same_key.clear()
         same_key.append(plan)
         return plan
+
+    def _choose(
+        self, publisher: bytes, pds: Iterable[tuple[PdHeader, int]], source: bytes
+    ) -> tuple[list[ChosenPd], list[DroppedPd]]:
+        """Return the subscriptions that accept each PD, and counters of PDs that none accepts."""
+        chosen: list[ChosenPd] = []
+        refused = []
+        for header, offset in pds:
+            match = self._match(publisher, header, source)
+            if not isinstance(match, DroppedPd):
+                chosen += [(subscription, header, offset) for subscription in match]
+            elif match is not _UNKNOWN_ID or not is_signature(header):
+                refused.append(match)
+        return chosen, refused
+
+    def _plan_checked(self, layout: _LearnedLayout, signature: int | None) -> FramePlan:
+        """Return the plan of *layout*, whose signature is at *signature* if it has one."""
+        checked = [each for each, _, _ in layout.chosen if each.auth is not Authentication.OFF]
+        if not checked:
+            return self._plan(layout)
+        if signature is None:
+            return self._plan_without(layout, checked, PdDropReason.UNSIGNED)
+        counters = [each.slot.words + RxWord.SIGNED for each in checked]
+        check = SignatureCheck(self._keys, signature, self.words, counters)
+        refusing = {fault: self._plan_without(layout, checked, fault) for fault in SIGNATURE_FAULTS}
+        return self._plan(layout, (check, refusing))
+
+    def _plan_without(
+        self, layout: _LearnedLayout, checked: Iterable[RxSubscription], fault: PdDropReason
+    ) -> FramePlan:
+        """Return the plan of frames with *fault*, which all *checked* count and some refuse."""
+        required = Authentication.REQUIRED
+        chosen = [each for each in layout.chosen if each[0].auth is not required]
+        refused = [*layout.refused, _taken_though(fault, checked)]
+        return self._plan(layout._replace(chosen=chosen, refused=refused))
+
+    def _plan(self, layout: _LearnedLayout, signature: Signature | None = None) -> FramePlan:
+        taking = [subscription for subscription, _, _ in layout.chosen]
+        return FramePlan(
+            layout.head,
+            layout.end,
+            layout.pds,
+            [_take(subscription, header, offset) for subscription, header, offset in layout.chosen],
+            layout.refused,
+            watch=layout.watch,
+            requests=[
+                (s.tracker, s.slot.name) for s in taking if s.slot.name in self._requests.names
+            ],
+            answers=[(s.tracker, s.answer) for s in taking if s.answer is not None],
+            any_publisher={s.tracker for s in taking if not s.slot.publisher},
+            signature=signature,
+        )
 
     def _watch(
         self,
@@ -434,6 +504,7 @@ class SubscriptionTable:
                     slot.sender_cycle_us,
                     subscription.timeout_ns,
                     slot.poll_request,
+                    subscription.auth,
                 )
                 if slot.publisher
                 else slot.name
@@ -476,10 +547,10 @@ def _take(subscription: RxSubscription, header: PdHeader, offset: int) -> Accept
     return AcceptedPd(subscription.tracker, slot.words, offset, slot.offset, size, alternate)
 
 
-def _wrong_length(taking: Iterable[RxSubscription]) -> DroppedPd:
-    """Count a frame with a wrong Length, and the PDs that are taken from it."""
-    index = PD_DROP_INDEX[PdDropReason.WRONG_LENGTH]
-    words = dict.fromkeys(each.slot.words for each in taking)
+def _taken_though(reason: PdDropReason, concerned: Iterable[RxSubscription]) -> DroppedPd:
+    """Count a frame under *reason*, and for the subscriptions that it concerns."""
+    index = PD_DROP_INDEX[reason]
+    words = dict.fromkeys(each.slot.words for each in concerned)
     counters = [StationWord.DISCARDED + index, *(each + RxWord.DISCARDED + index for each in words)]
     return DroppedPd(tuple(counters))
 

@@ -7,7 +7,7 @@ step and copies PDs that lie side by side, both in the frame and in the image, i
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 from eap.codec import datatypes
@@ -16,6 +16,7 @@ from eap.codec.pd import FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader, foll
 from eap.errors import CodecError, TruncatedError
 from eap.ids import NetId
 from eap.pd.address import SourceWatch, source_octets
+from eap.pd.authentication import SignatureCheck
 from eap.pd.copyplan import CopyPlan
 from eap.pd.image import Image, default_value, put
 from eap.pd.layout import RxSlot
@@ -40,11 +41,13 @@ class RxSubscription:
         alternates: Copy plans of other accepted layouts, by version and length.
         answer: Its role as an answer to *poll*; None if it is pushed.
         source: The address that its frames must come from; empty for any.
+        auth: What is made of the signature of its frames.
     """
 
     __slots__ = (
         "alternates",
         "answer",
+        "auth",
         "ignore_version",
         "slot",
         "source",
@@ -67,6 +70,7 @@ class RxSubscription:
         self.timeout_ns = spec.timeout_ms * 1_000_000
         self.substitute = substitute
         self.source = source_octets(spec.source) if spec.source else b""
+        self.auth = spec.auth
         self.tracker: SequenceTracker
 
     def mismatch(self, version: int, length: int, source: bytes) -> PdDropReason | None:
@@ -159,6 +163,10 @@ class FrameHead(NamedTuple):
     eap_sm: int = 0
 
 
+Signature: TypeAlias = "tuple[SignatureCheck, Mapping[PdDropReason, FramePlan]]"
+"""Check of the signature of a frame, with the plans of the frames that it refuses."""
+
+
 class FramePlan:
     """The plan of one layout.
 
@@ -176,6 +184,9 @@ class FramePlan:
         requests: RxPDs that request PDs of this station, with their trackers.
         answers: RxPDs that this station polled, likewise.
         any_publisher: Trackers that follow any publisher.
+        signature: Check of the frame's signature, with the plans of frames that it refuses, by
+            reason; None if no subscription wants it.
+        has_checks: Whether there is anything of the last two.
         publisher: The frame's, as a number.
         watch: The addresses that such frames come from; it belongs to this plan if they do.
     """
@@ -187,6 +198,7 @@ class FramePlan:
         "any_publisher",
         "end",
         "expected",
+        "has_checks",
         "has_more",
         "head",
         "headers",
@@ -195,6 +207,7 @@ class FramePlan:
         "publisher",
         "refused",
         "requests",
+        "signature",
         "watch",
     )
 
@@ -210,6 +223,7 @@ class FramePlan:
         requests: Iterable[tuple[SequenceTracker, str]] = (),
         answers: Iterable[tuple[SequenceTracker, PollAnswer]] = (),
         any_publisher: Iterable[SequenceTracker] = (),
+        signature: Signature | None = None,
     ) -> None:
         """Build the plan from (header without quality, data length) of each PD and their fate."""
         pds = tuple(pds)
@@ -233,13 +247,34 @@ class FramePlan:
         more = (self.alternates, self.refused, self.requests, self.answers, head.eap_sm)
         self.has_more = any(more)
         self.any_publisher = tuple(any_publisher)
+        self.signature = signature
+        self.has_checks = bool(self.any_publisher) or signature is not None
         self.publisher = int.from_bytes(head.publisher)
         self.watch = watch
+
+    @property
+    def alternatives(self) -> int:
+        """Number of plans that belong to the layout."""
+        return 1 if self.signature is None else 1 + len(self.signature[1])
 
     @property
     def has_wrong_length(self) -> bool:
         """True if the Length of the EtherCAT header does not cover the PDs, or too much."""
         return self.end != PD_FRAME_START + self.head.length
+
+    def admit(self, data: memoryview) -> FramePlan:
+        """Return the plan for a frame by its signature: this one, or that of what is wrong.
+
+        Trackers that follow any publisher follow that of the frame.
+        """
+        plan = self
+        if self.signature is not None:
+            check, refusing = self.signature
+            if (fault := check.fault(data)) is not None:
+                plan = refusing[fault]
+        for tracker in plan.any_publisher:
+            tracker.follow(plan.publisher)
+        return plan
 
     def enter_toggle(self, cycle: int) -> None:
         """Note the toggle bit of a frame of *cycle*; senders that leave EAP SM 0 have none."""

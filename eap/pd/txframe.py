@@ -20,8 +20,9 @@ from typing import NamedTuple, TypeAlias
 
 from eap.codec import datatypes
 from eap.codec.ethercat import EtherCatHeader
-from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PdFrameHeader, PdHeader
+from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader
 from eap.ids import NetId
+from eap.pd.authentication import SIGNATURE_ID, SIGNATURE_SIZE, SIGNATURE_VERSION
 from eap.pd.image import Image, Inputs
 from eap.pd.layout import FrameSlot, TxSlot
 from eap.pd.link import FrameChannel, OutFrame
@@ -309,6 +310,8 @@ class TxFrame:
         gate: tuple[int, int],
         channel: FrameChannel,
         destination: str,
+        *,
+        is_signed: bool = False,
     ) -> None:
         self.slot = slot
         self.destination = destination
@@ -318,6 +321,7 @@ class TxFrame:
         self.suppressed = False
         self._publisher = publisher
         self._channel = channel
+        self._is_signed = is_signed
         self._selections: dict[tuple[TxPd, ...], Selection] = {}
         self.whole = self._select(pds)
         self.schedule = _common_schedule(pds)
@@ -371,23 +375,36 @@ class TxFrame:
         return selection
 
     def _build(self, pds: tuple[TxPd, ...]) -> OutFrame:
-        return build_frame(self._publisher, pds, self._channel, self.destination or NO_ADDRESS)
+        destination = self.destination or NO_ADDRESS
+        return build_frame(
+            self._publisher, pds, self._channel, destination, is_signed=self._is_signed
+        )
 
 
 def build_frame(
-    publisher: NetId, pds: tuple[TxPd, ...], channel: FrameChannel, destination: str
+    publisher: NetId,
+    pds: tuple[TxPd, ...],
+    channel: FrameChannel,
+    destination: str,
+    *,
+    is_signed: bool = False,
 ) -> OutFrame:
-    """Return a frame with all headers and no data yet."""
+    """Return a frame with all headers and no data yet; a signed one ends with a signature."""
     header = channel.link_header(destination)
     # The cycle counter is 0 here; patch() writes it in each cycle, at CYCLE_OFFSET.
-    body = PdFrameHeader(publisher, len(pds), 0).encode()
+    body = PdFrameHeader(publisher, len(pds) + is_signed, 0).encode()
     for pd in pds:
         body += PdHeader(pd.slot.pd_id, pd.slot.version, pd.slot.size).encode()
         body += bytes(pd.slot.size)
+    signature = 0
+    if is_signed:
+        body += PdHeader(SIGNATURE_ID, SIGNATURE_VERSION, SIGNATURE_SIZE).encode()
+        signature = PD_FRAME_START + len(body)
+        body += bytes(SIGNATURE_SIZE)
     # Length does not count the padding behind it, by which receivers tell the two apart.
     octets = header + EtherCatHeader(len(body)).encode() + body
     buffer = bytearray(octets.ljust(channel.minimum_size, b"\0"))
-    return OutFrame(buffer, len(header), destination)
+    return OutFrame(buffer, len(header), destination, signature)
 
 
 def _data_offsets(pds: tuple[TxPd, ...], headroom: int) -> Iterator[int]:

@@ -34,6 +34,12 @@ class PdDropReason(StrEnum):
     """The frame came from another address than the publisher's."""
     WRONG_LENGTH = auto()
     """The data was taken, but the Length of the frame is not that of its PDs."""
+    UNSIGNED = auto()
+    """The frame has no signature, and the subscription looks at it."""
+    BAD_TAG = auto()
+    """The signature is not that of a key of this station."""
+    REPLAYED = auto()
+    """The counter of the signature has not risen."""
 
 
 class Reason(StrEnum):
@@ -86,7 +92,9 @@ class StationWord(IntEnum):
     TORN = 15
     """Cycles in which a writer had stopped in the middle of writing."""
     LATENESS_MAX_NS = 16
-    DISCARDED = 17
+    SIGNING_KEY = 17
+    """Number of the key that signs its frames; 0 without one."""
+    DISCARDED = 18
     LATENESS = DISCARDED + len(PD_DROP_REASONS)
     LINKS_HELD = LATENESS + HISTOGRAM_BINS
     """Values that no link could pass on, because their source was infinite or no number."""
@@ -161,7 +169,9 @@ class RxWord(IntEnum):
     WRONG_SOURCE = 7
     """Address of the last frame dropped because it is not the publisher's."""
     WRONG_SOURCE_AT_NS = 8
-    DISCARDED = 9
+    SIGNED = 9
+    """Counter of the last signature that was accepted; 0 before the first."""
+    DISCARDED = 10
     RECEIVED = DISCARDED + len(PD_DROP_REASONS)
     DUPLICATED = RECEIVED + 1
     REORDERED = RECEIVED + 2

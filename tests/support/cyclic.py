@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.ids import InterfaceUri, NetId
+from eap.pd.authentication import KeyRing
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image, format_image
 from eap.pd.layout import RxSlot, VariableSlot, plan_layout
@@ -23,7 +24,7 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.station import Station
-from eap.pd.subscriber import Subscriber
+from eap.pd.subscriber import NO_KEYS, Subscriber
 from eap.pd.words import PD_DROP_REASONS, RxWord, StationWord
 
 PEER = "5.23.91.23.1.1"
@@ -105,8 +106,10 @@ class Receiver:
         variables: Sequence[VariableSpec],
         cycle_us: int = 1000,
         lenient: bool = False,
+        keys: KeyRing = NO_KEYS,
     ):
         self.lenient = lenient
+        self.keys = keys
         self.spec = station(cycle_us=cycle_us, variables=tuple(variables), subscriptions=tuple(pds))
         self.image = image_of(self.spec)
         self.start(0)
@@ -120,6 +123,7 @@ class Receiver:
             self.spec.cycle_us * 1000,
             PollRequests(()),
             lenient=self.lenient,
+            keys=self.keys,
         )
         self.subscriber.open(now_ns)
 

@@ -12,6 +12,7 @@ from eap.device.eap_spec import fill
 from eap.ids import InterfaceUri, NetId
 from eap.pd.spec import (
     REQUESTER,
+    Authentication,
     CounterSource,
     LengthCheck,
     LinkSpec,
@@ -180,6 +181,7 @@ def stations(draw: st.DrawFn) -> StationSpec:
                 mac=draw(st.sampled_from(("", "02:00:00:00:00:08"))) if is_net_id else "",
                 monitor_interval_ms=draw(st.sampled_from([100, 5000])) if is_monitored else 0,
                 monitor_ip="10.0.0.9" if has_ip else "",
+                sign=draw(st.booleans()),
             )
         )
     return StationSpec(
@@ -232,6 +234,7 @@ def _subscription(draw: st.DrawFn, number: int, names: tuple[str, ...]) -> RxPdS
         step=draw(st.integers(0, 2)),
         changeable=draw(st.booleans()),
         source=draw(st.sampled_from(["", "10.0.0.1", "02:00:00:00:00:01"])),
+        auth=draw(st.sampled_from(Authentication)),
     )
 
 

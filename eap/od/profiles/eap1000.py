@@ -16,10 +16,11 @@ specification.
 
 from __future__ import annotations
 
-from enum import IntEnum, StrEnum, auto
+from enum import IntEnum
 
 from eap.ids import DestinationKind
 from eap.od.model import RO, RW, Access, ObjectCode
+from eap.od.profiles.eap1000_keys import Derived, EapLive
 from eap.od.profiles.table import (
     OWN_TYPE,
     Form,
@@ -39,73 +40,6 @@ from eap.od.profiles.table import (
 PROFILE = 5001
 """Of modular devices."""
 MODULE_PROFILE = 1000
-
-
-class EapLive(StrEnum):
-    """Keys of live entries; the name of the object says of which variable, frame or PD."""
-
-    VALUE = auto()
-    """Of the variable, as it lies in the process image."""
-    FRAME_STATE = auto()
-    FRAME_CTRL = auto()
-    FRAME_WHOLE = auto()
-    FRAME_PARTIAL = auto()
-    FRAME_SKIPPED = auto()
-    TX_VAR_STATE = auto()
-    TX_VAR_CTRL = auto()
-    TX_LAST_REASON = auto()
-    TX_SKIPPED = auto()
-    TX_SENT_CYCLE = auto()
-    TX_SENT_DIVIDER = auto()
-    TX_SENT_CHANGE = auto()
-    TX_SENT_CHANGE_TIMEOUT = auto()
-    TX_SENT_EVENT = auto()
-    TX_SENT_POLL = auto()
-    RX_QUALITY = auto()
-    RX_CYCLE_INDEX = auto()
-    RX_VAR_STATE = auto()
-    RX_STATE = auto()
-    RX_RECEIVED = auto()
-    RX_LOST = auto()
-    RX_DUPLICATED = auto()
-    RX_REORDERED = auto()
-    RX_LATE = auto()
-    RX_TIMEOUTS = auto()
-    RX_REPEATED = auto()
-    RX_JITTER_MAX = auto()
-    RX_DISCARDED_VERSION = auto()
-    RX_DISCARDED_LENGTH = auto()
-    RX_DISCARDED_SUPPRESSED = auto()
-    RX_DISCARDED_STALE = auto()
-    RX_DISCARDED_WRONG_SOURCE = auto()
-    RX_DISCARDED_WRONG_LENGTH = auto()
-    STATION_CYCLE = auto()
-    STATION_OVERRUNS = auto()
-    STATION_RESTARTS = auto()
-    STATION_TORN = auto()
-    STATION_LATENESS_MAX = auto()
-    STATION_LINKS_HELD = auto()
-    STATION_DISCARDED_WRONG_PUBLISHER = auto()
-    STATION_DISCARDED_UNKNOWN_ID = auto()
-    STATION_DISCARDED_TRUNCATED = auto()
-    STATION_DISCARDED_COUNT_TOO_LARGE = auto()
-    STATION_DISCARDED_WRONG_TYPE = auto()
-    STATION_DISCARDED_TOO_MANY_REQUESTS = auto()
-    STATION_DISCARDED_NO_SENDER = auto()
-    STATION_DISCARDED_WRONG_LENGTH = auto()
-
-
-class Derived(StrEnum):
-    """Keys of entries that the dictionary computes from others."""
-
-    BIT_LENGTH = auto()
-    TYPE_CODE = auto()
-    PDO_LENGTH = auto()
-    FRAME_LENGTH = auto()
-    COUNT = auto()
-    """Objects of the kind that the sub-index stands for, see COUNTED."""
-    NEXT_FREE = auto()
-    """First free index of that kind, 0 if all are taken."""
 
 
 class Var(IntEnum):
@@ -141,7 +75,8 @@ class FrameSub(IntEnum):
     CHANGEABLE = 13
     FRAME_CONTROL = 14
     FRAME_LENGTH = 15
-    TXPD = 16
+    SIGN = 16
+    TXPD = 17
 
 
 class Tx(IntEnum):
@@ -189,6 +124,7 @@ class Rx(IntEnum):
     CHANGEABLE = 16
     STATE = 17
     SOURCE = 18
+    AUTHENTICATION = 19
 
 
 class Status(IntEnum):
@@ -274,6 +210,14 @@ class Waking(IntEnum):
 
     CYCLE = 0
     ARRIVAL = 1
+
+
+class Authenticated(IntEnum):
+    """Treatment of the signature of frames with a PD."""
+
+    OFF = 0
+    COUNT = 1
+    REQUIRED = 2
 
 
 class LengthChecked(IntEnum):
@@ -391,6 +335,8 @@ TX_FRAME = ProfileObject(
              "Bit 0 suppresses the frame."),
         derived(FrameSub.FRAME_LENGTH, "Frame length", "UINT", Derived.FRAME_LENGTH,
                 "Bytes with all its PDs."),
+        setting(FrameSub.SIGN, "Sign", "BOOL",
+                "Whether a last PD signs it with a key of the station.", key="sign"),
         config(FrameSub.TXPD, "TxPD {n}", "UINT", "Index of a PD that it carries; 0 none.",
                last=MAX_ENTRIES, form=Form.INDEX, refers=(0xD000,)),
     ),
@@ -513,6 +459,9 @@ RX_PD = ProfileObject(
                 "Address that its frames must come from: MAC on Ethernet, else IPv4; empty any. "
                 "Writing another publisher empties it.", changeable=True, key="source",
                 rule=Rule.SOURCE),
+        setting(Rx.AUTHENTICATION, "Authentication", "USINT",
+                "Of its frames: 0 not looked at, 1 counted, 2 required.", maximum=2, key="auth",
+                words=Authenticated),
     ),
     "One PD to receive: its sender, and its PDO.", dynamic=True, companion=0xC000,
     section="subscribe",
@@ -538,6 +487,12 @@ RX_DIAGNOSIS = ProfileObject(
              "Taken, though the frame's Length was wrong."),
         live(14, "Repeated", "ULINT", EapLive.RX_REPEATED,
              "Came twice, and so said the toggle bit."),
+        live(15, "Unsigned", "ULINT", EapLive.RX_DISCARDED_UNSIGNED,
+             "Its frame had no signature."),
+        live(16, "Bad tag", "ULINT", EapLive.RX_DISCARDED_BAD_TAG,
+             "The signature of its frame was wrong."),
+        live(17, "Replayed", "ULINT", EapLive.RX_DISCARDED_REPLAYED,
+             "The counter of the signature had not risen."),
     ),
     "What became of the RxPD of the same number.",
 )  # fmt: skip

@@ -14,7 +14,7 @@ from eap.codec.datatypes import DataType
 from eap.errors import ImageError
 from eap.net.image_file import StationImage
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import EapLive
+from eap.od.profiles.eap1000_keys import EapLive
 from eap.pd.image import Image
 from eap.pd.layout import (
     FRAME_CTRL,

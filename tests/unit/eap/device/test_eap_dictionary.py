@@ -16,16 +16,8 @@ from eap.od import info, model
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.model import Access, ObjectCode, OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import (
-    MAX_ENTRIES,
-    MORE_TX_PDO,
-    AddressMode,
-    EapLive,
-    FrameSub,
-    Rx,
-    Tx,
-    Var,
-)
+from eap.od.profiles.eap1000 import MAX_ENTRIES, MORE_TX_PDO, AddressMode, FrameSub, Rx, Tx, Var
+from eap.od.profiles.eap1000_keys import EapLive
 from eap.pd.device import DeviceFault, FaultCode
 from eap.pd.spec import PortKind, PortSpec, VariableSpec
 from tests.support.downloads import (

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from eap.control.protocol import ErrorCode
 from eap.errors import ControlError
 from eap.net.image_file import StationImage
-from eap.od.profiles.eap1000 import EapLive
+from eap.od.profiles.eap1000_keys import EapLive
 from eap.pd.spec import CsvSource, StationSpec, VariableSpec, Writer
 from eap.services.control.methods import Methods
 from eap.services.device.image_values import ImageValues

@@ -7,7 +7,7 @@ import pytest
 from eap.codec import datatypes
 from eap.od.model import Access, ObjectCode
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import Derived, EapLive
+from eap.od.profiles.eap1000_keys import Derived, EapLive
 from eap.od.profiles.table import CONFIG, OWN_TYPE, UNITS
 from eap.pd.device import DeviceState
 from eap.pd.spec import LengthCheck, Substitute, Wake, Writer

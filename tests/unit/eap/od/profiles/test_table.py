@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from eap.codec import datatypes
 from eap.od.model import RO, RW, ObjectCode
-from eap.od.profiles.eap1000 import Derived, EapLive
+from eap.od.profiles.eap1000_keys import Derived, EapLive
 from eap.od.profiles.master1100 import CONFIGURED_LIST, DIAGNOSIS, MasterLive
 from eap.od.profiles.table import (
     CONFIG,

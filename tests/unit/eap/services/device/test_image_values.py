@@ -10,7 +10,7 @@ from eap.device.eap_spec import fill
 from eap.net.image_file import StationImage, create_image
 from eap.od.model import OdState
 from eap.od.profiles import eap1000 as profile
-from eap.od.profiles.eap1000 import EapLive
+from eap.od.profiles.eap1000_keys import EapLive
 from eap.pd.layout import plan_layout
 from eap.pd.spec import VariableSpec, Writer
 from eap.pd.words import (
