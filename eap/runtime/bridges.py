@@ -123,7 +123,7 @@ def _findings(where: str, status: BridgeStatus) -> list[dict[str, Any]]:
     for peer in status.peers:
         at = f"{where} {peer.name}"
         if not peer.is_up and peer.reason:
-            what = f"no connection to {peer.url}: {peer.reason}"
+            what = f"no connection to {peer.url or peer.name}: {peer.reason}"
             advice = "its variables have their substitutes; it tries again by itself"
             rows.append(_row("warning", at, what, advice, peer.since))
         elif peer.failed:

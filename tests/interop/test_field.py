@@ -386,3 +386,22 @@ def test_bytes_that_are_no_protocol_end_one_connection_only(plant: Appliance, po
         good.sendall(bytes.fromhex(request))
         assert good.recv(100)
     assert plant.pid("s7" if port == 2102 else "modbus") == pid
+
+
+def test_changed_sources_are_followed_while_the_plant_runs(
+    plant: Appliance, folder: Plants, press: Press
+) -> None:
+    wait_until(lambda: plant.values("mill")["temp"] == 21.5)
+    struct.pack_into(">f", press.db1, 36, 33.5)
+    changed = PLANT.replace("address: DB1.DBD4", "address: DB1.DBD36")
+    changed = changed.replace("outside: {kind: s7, controller: press, address: DB9.DBW0}", "")
+    file = folder.write(changed, "changed.yaml")
+    plant.command("apply", str(file))
+    wait_until(lambda: plant.values("mill")["temp"] == 33.5)
+    wait_until(lambda: plant.values("mill")["press.ok"] is True)
+    assert peer(plant, "s7")["failed"] == 0
+    again = changed.replace("    press: {host", "    forge: {host")
+    again = again.replace("controller: press", "controller: forge").replace("press.ok", "forge.ok")
+    plant.command("apply", str(folder.write(again, "again.yaml")))
+    wait_until(lambda: "restart the appliance" in str(peer(plant, "s7")["reason"]))
+    assert plant.values("mill")["forge.ok"] is False

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from functools import partial
+from time import time
 from typing import Literal, TypeVar
 
 from eap.bridges.bridge import Bridge
@@ -27,6 +28,7 @@ from eap.runtime.bridges import PeerStatus
 FOLLOW_S = 5.0
 """Period in which changed sources and targets are noticed."""
 _RETRY_S = 0.5
+_UNKNOWN = "the controller was added while the plant ran; restart the appliance"
 
 ControllerT = TypeVar("ControllerT", S7Controller, ModbusController)
 
@@ -59,8 +61,7 @@ async def run_field(
             group.create_task(FieldServing(bridge, server, key, make_session).run())
         else:
             bridge.ready()
-        if controllers:
-            group.create_task(_follow(bridge, key, controllers, make_link))
+        group.create_task(_follow(bridge, key, controllers, make_link))
 
 
 async def _follow(
@@ -111,6 +112,9 @@ async def _run(
         peers.append(status)
         make = partial(make_link, controller)
         clients[name] = FieldClient(bridge, controller, controller.port, points, status, make)
+    # Of a change of the running plant: this process got its controllers at the start.
+    unknown = sorted({row.controller for row in rows} - controllers.keys())
+    peers += [PeerStatus(name=name, reason=_UNKNOWN, since=time()) for name in unknown]
     bridge.status.peers = peers
     targets: dict[str, list[tuple[FieldClient, PointKey]]] = {}
     for row in rows:
