@@ -101,6 +101,16 @@ class MqttClient(aiomqtt.Client):
         numbers = (each.value if isinstance(each, ReasonCode) else each for each in codes)
         return [topic for topic, number in zip(wanted, numbers, strict=True) if number >= _REFUSED]
 
+    def publish_soon(self, topic: str, payload: bytes, *, retain: bool) -> None:
+        """Queue a message of QoS 0, which leaves with a later one that ``publish`` waits for.
+
+        Raises:
+            MqttError: the connection is lost.
+        """
+        info = self._client.publish(topic, payload, 0, retain)
+        if info.rc:
+            raise MqttError(f"a message could not be queued: {info.rc.name}")
+
     def limit_connect(self, timeout_s: float) -> None:
         """Set how long the thread may wait that connects."""
         self._client.connect_timeout = timeout_s

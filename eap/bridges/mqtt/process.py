@@ -22,11 +22,9 @@ from eap.errors import EapError
 from eap.net.mqtt import Handlers, MqttLink
 from eap.runtime.startup import Startup
 
-_ROOM = 64
+_ROOM = 256
 """Messages that wait for the broker; what else waits is replaced by newer values."""
 _MAX_COMMANDS = 64
-_LATER_S = 0.02
-"""Pause where the broker takes messages too slowly."""
 _WARNED_EVERY_S = 60.0
 
 logger = logging.getLogger(__name__)
@@ -129,7 +127,9 @@ class BrokerConnection:
         self._has_news = asyncio.Event()
         self._commands: asyncio.Queue[Command] = asyncio.Queue(_MAX_COMMANDS)
         self._warned_at_s = float("-inf")
-        handlers = Handlers(self._connected, self._lost, self._receive, self._overrun)
+        handlers = Handlers(
+            self._connected, self._lost, self._receive, self._overrun, self._drained
+        )
         self._link = MqttLink(spec, spec.client_id, will=core.will, handlers=handlers)
         self._is_connected = False
 
@@ -153,9 +153,6 @@ class BrokerConnection:
                 await self._has_news.wait()
                 self._has_news.clear()
                 self._send()
-                if self._core.has_waiting:
-                    await asyncio.sleep(_LATER_S)
-                    self._has_news.set()
 
     async def _tick(self, period_s: float) -> None:
         """Have values published that are due by their period."""
@@ -221,6 +218,10 @@ class BrokerConnection:
     def _answer(self, command: Command, error: str) -> None:
         if (message := self._core.answer(command, error, time_ns())) is not None:
             self._link.send(message)
+
+    def _drained(self) -> None:
+        if self._core.has_waiting:
+            self._has_news.set()
 
     def _overrun(self) -> None:
         self._bridge.status.received += 1
