@@ -193,6 +193,8 @@ LONGEST_BACKOFF_NS = 5_000_000_000
 HEALTHY_AFTER_NS = 1_000_000_000
 """A process that lived this long is started again at once."""
 
+_FAILURES = 3
+"""Ends of a process without a start that succeeded, after which it does not count as alive."""
 _LAST_LINES = 12
 _LAUNCHER = "eap.runtime.startup"
 
@@ -228,6 +230,8 @@ class Child:
         self.fault = ""
         """Reason that an optional process does not run, for ``status``."""
         self.is_ready = False
+        self._failures = 0
+        """Ends since it was ready last."""
         self.report: dict[str, Any] = {}
         self.started_ns = 0
         self.pid_fd = -1
@@ -245,6 +249,12 @@ class Child:
     def pid(self) -> int:
         """Process id, 0 when there is no process."""
         return self._process.pid if self._process else 0
+
+    @property
+    def is_alive(self) -> bool:
+        """True if it runs, or is being started and not again and again in vain."""
+        is_starting = self.pid and not self.watch.is_stuck and self._failures < _FAILURES
+        return self.is_ready or bool(is_starting)
 
     def start(self, handover: InheritedRecord, descriptors: Iterable[int], now_ns: int) -> None:
         """Start the process; *descriptors* are those that *handover* speaks of."""
@@ -296,6 +306,7 @@ class Child:
         for each in reports:
             if each.ready is not None:
                 self.is_ready = True
+                self._failures = 0
                 self.report = each.ready
         if self.is_ready or not data:
             os.close(self.report_fd)
@@ -335,6 +346,7 @@ class Child:
             pass
         self.close()
         self.is_ready = False
+        self._failures += 1
         self.watch.end()
         self._process = None
         return code, self._last_lines[-1] if self._last_lines else "no output"

@@ -46,6 +46,7 @@ from eap.runtime.store import StationStore, adopt_plant_file, effective
 from eap.supervisor.child import Child, OutputHandler, StartEvent, describe_end
 from eap.supervisor.optional import missing_extra, optional_processes
 from eap.supervisor.part import load_part
+from eap.supervisor.service_manager import CycleProgress, ServiceManager
 from eap.supervisor.sockets import (
     SharedSockets,
     UnavailableSocketError,
@@ -185,6 +186,9 @@ class Supervisor:
         self._leaving: dict[Child, int] = {}
         """Segments of buses that were closed, and when they are killed."""
         self._restart_ns: dict[Child, int] = {}
+        self._manager = ServiceManager(os.environ)
+        station = plant.stations[0]
+        self._progress = CycleProgress(folder.image(station.name), station.cycle_us)
         self._announced = False
         self._is_info_old = False
         self._exit_code: int | None = None
@@ -324,7 +328,7 @@ class Supervisor:
         now_ns = self._clock()
         deadlines = [*self._restart_ns.values(), *self._leaving.values()]
         timeouts = (child.watch.next_timeout() for child in self._children)
-        deadlines += [each for each in timeouts if each is not None]
+        deadlines += [each for each in (*timeouts, self._manager.next_ns) if each is not None]
         return max(0, -(-(min(deadlines) - now_ns) // 1_000_000)) if deadlines else -1
 
     def _wait(self, wake_fd: int, timeout_ms: int) -> None:
@@ -380,6 +384,8 @@ class Supervisor:
             # Later than the plant, whose start they would delay; and not here, where a descriptor
             # of theirs may be equal to one that has fired.
             self._restart_ns |= dict.fromkeys(self._extras, self._clock())
+            names = ", ".join(self._info.stations)
+            self._manager.notify(READY="1", STATUS=f"plant {self._info.plant}: {names}")
             line = msgspec.json.encode({"ready": True, "stations": self._info.stations})
             try:
                 os.write(1, line + b"\n")
@@ -474,6 +480,9 @@ class Supervisor:
                 self._leaving[child] = now_ns + GRACE_NS
         for child in self._children:
             self._check_start(child, now_ns)
+        if (next_ns := self._manager.next_ns) is not None and now_ns >= next_ns:
+            is_alive = all(child.is_alive for child in self._needed)
+            self._manager.check(now_ns, is_alive=is_alive and self._progress.is_alive(now_ns))
 
     def _check_start(self, child: Child, now_ns: int) -> None:
         watch = child.watch
@@ -495,6 +504,7 @@ class Supervisor:
 
     def _end_children(self) -> None:
         """End all: segments last, for the engine brings their slaves to rest."""
+        self._manager.close()
         self._end((*self._extras, self._engine, self._services), GRACE_NS)
         self._end((*self._segments.values(), *self._leaving), SEGMENT_GRACE_NS)
 
