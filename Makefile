@@ -13,7 +13,7 @@ BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo valve test test-tools properties check structure bench clean
+.PHONY: help setup demo valve test test-tools test-package properties check structure bench dist deb clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -42,10 +42,21 @@ PYTEST := sh tools/isolated.sh $(BIN)/python -m pytest -n auto --dist loadfile -
 
 test: setup  ## run all tests of the product; as root, first install the programs they use
 	@sh tools/install_peers.sh test || echo 'make test: going on; what needs them is skipped and listed'
-	@$(PYTEST) --ignore=tests/tools $(ARGS)
+	@$(PYTEST) --ignore=tests/tools --ignore=tests/package $(ARGS)
 
 test-tools: setup  ## run the tests of tools/: fuzz targets, page of faults, benchmarks
 	@$(PYTEST) tests/tools $(ARGS)
+
+# The wheel is built from the commit; its time is that of all files.
+dist: setup  ## build wheel and archive of sources in dist/
+	@rm -rf dist && SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/hatchling build --directory dist
+
+deb: dist  ## build the Debian package in dist/, for the Python of this Debian
+	@$(BIN)/python -m tools.package.deb dist/*.whl dist
+
+test-package: deb  ## test wheel and Debian package (as root: in a clean Debian, made by debootstrap)
+	@sh tools/install_peers.sh package || echo 'make test-package: going on; what needs them is skipped and listed'
+	@$(BIN)/python -m pytest tests/package $(ARGS)
 
 properties: setup  ## run the property tests with all their examples; make test takes a quarter
 	@$(PYTEST) -m hypothesis --hypothesis-profile=full tests $(ARGS)

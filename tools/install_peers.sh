@@ -1,15 +1,16 @@
 #!/bin/sh
 # Makes sure of the Debian programs that a group of commands meets as peers or builds its networks with;
 # for tests also of npm packages.
-# Usage: tools/install_peers.sh test|bench      Exit status 1 when a program is still missing.
+# Usage: tools/install_peers.sh test|package|bench      Exit status 1 when a program is still missing.
 set -eu
 here=$(dirname "$0")
 case ${1:-} in
     # command=package
     test) wanted="tshark=tshark ip=iproute2 setpriv=util-linux mosquitto=mosquitto mosquitto_sub=mosquitto-clients openssl=openssl prometheus=prometheus pg_ctlcluster=postgresql chromium=chromium tmux=tmux" ;;
+    package) wanted="debootstrap=debootstrap unshare=util-linux" ;;
     bench) wanted="cyclictest=rt-tests ip=iproute2 taskset=util-linux" ;;
     *)
-        echo "usage: $0 test|bench" >&2
+        echo "usage: $0 test|package|bench" >&2
         exit 2
         ;;
 esac
