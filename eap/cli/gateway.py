@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from eap.cli.completion import complete_target
 from eap.cli.group import CommandGroup, LazyGroup
 from eap.cli.output import Column, Renderer, TextTable
 from eap.cli.params import (
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 
 _JSON = json_option("Print one object per gateway; docs/control.md explains its fields.")
-_TARGET = click.argument("target", metavar="STATION[/PORT]")
+_TARGET = click.argument("target", metavar="STATION[/PORT]", shell_complete=complete_target)
 _SHOWN_CLIENTS = 10
 """Number of clients that are shown: each command is a client, so there may be hundreds."""
 
@@ -77,7 +78,7 @@ def stop(target: str, plant: str | None, output: Renderer) -> None:
 
 
 @gateway.command(short_help="Show sockets, clients and requests.")
-@click.argument("target", metavar="[STATION[/PORT]]", default="")
+@click.argument("target", metavar="[STATION[/PORT]]", default="", shell_complete=complete_target)
 @plant_option
 @_JSON
 def status(target: str, plant: str | None, output: Renderer) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
+from eap.cli.completion import complete_target
 from eap.cli.group import ExitCode
 from eap.cli.output import Column, Renderer, Styled, TextTable
 from eap.cli.params import examples, json_option, plant_option
@@ -58,7 +59,9 @@ def scan(via: str | None, plant: str | None, output: Renderer) -> None:
         "eapctl trace 5.1.2.3.1.1:851 --via island-02",
     ),
 )
-@click.argument("targets", nargs=-1, required=True, metavar="TARGET…")
+@click.argument(
+    "targets", nargs=-1, required=True, metavar="TARGET…", shell_complete=complete_target
+)
 @_VIA
 @plant_option
 @json_option("Print one object per target; docs/trace.md explains its fields.")

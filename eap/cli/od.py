@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from eap.cli.completion import complete_target
 from eap.cli.group import CommandGroup, ExitCode
 from eap.cli.output import Renderer, TextTable
 from eap.cli.params import json_option, parse_entry, parse_octets, parse_type, plant_option
@@ -40,7 +41,9 @@ def target_argument(command: Callable[..., Any]) -> Callable[..., Any]:
     def with_target(*args: Any, target: str, plant: str | None, **params: Any) -> Any:
         return command(*args, target=_target(target, plant), **params)
 
-    return click.argument("target", metavar="TARGET")(plant_option(with_target))
+    return click.argument("target", metavar="TARGET", shell_complete=complete_target)(
+        plant_option(with_target)
+    )
 
 
 def _target(text: str, plant: str | None) -> Target:

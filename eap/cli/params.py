@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import click
 
+from eap.cli.completion import complete_bus, complete_plant, complete_station
 from eap.cli.output import Renderer
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri, ObjectId
@@ -56,14 +57,19 @@ def _to_output(ctx: click.Context, param: click.Parameter, is_json: bool) -> Ren
 
 def plant_option(command: CommandT) -> CommandT:
     """Add ``--plant``, which chooses among running appliances."""
-    return click.option("--plant", metavar="NAME", help="Only the appliance that runs this plant.")(
-        command
-    )
+    return click.option(
+        "--plant",
+        metavar="NAME",
+        help="Only the appliance that runs this plant.",
+        shell_complete=complete_plant,
+    )(command)
 
 
 def station_option(command: CommandT) -> CommandT:
     """Add ``--station``, which chooses among running stations."""
-    return click.option("--station", metavar="NAME", help="Only this station.")(command)
+    return click.option(
+        "--station", metavar="NAME", help="Only this station.", shell_complete=complete_station
+    )(command)
 
 
 def parse_names(words: tuple[str, ...]) -> dict[str, list[str]]:
@@ -292,7 +298,13 @@ def bus_options(command: CommandT) -> CommandT:
         " or udp://ADDRESS[:PORT].",
     )
     plant = click.option("--plant", metavar="NAME", help="Only the appliance that runs this plant.")
-    place = click.argument(_PLACE, required=False, callback=_to_port, metavar="STATION/PORT")
+    place = click.argument(
+        _PLACE,
+        required=False,
+        callback=_to_port,
+        metavar="STATION/PORT",
+        shell_complete=complete_bus,
+    )
     return place(interface(plant(command)))
 
 

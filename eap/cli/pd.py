@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from eap.cli.completion import complete_variables
 from eap.cli.group import CommandGroup
 from eap.cli.output import Renderer, value_text
 from eap.cli.params import (
@@ -58,7 +59,13 @@ def list_pds(plant: str | None, station: str | None, members: bool, output: Rend
 
 
 @pd.command()
-@click.argument("names", nargs=-1, required=True, metavar="STATION [VAR]...")
+@click.argument(
+    "names",
+    nargs=-1,
+    required=True,
+    metavar="STATION [VAR]...",
+    shell_complete=complete_variables,
+)
 @click.option("--count", type=click.IntRange(1), metavar="N", help="End after N lines.")
 @click.option(
     "--period",
@@ -100,7 +107,13 @@ def watch(
 
 
 @pd.command("set", context_settings={"ignore_unknown_options": True})
-@click.argument("words", nargs=-1, required=True, metavar="STATION VAR VALUE")
+@click.argument(
+    "words",
+    nargs=-1,
+    required=True,
+    metavar="STATION VAR VALUE",
+    shell_complete=complete_variables,
+)
 @plant_option
 @json_option("Print one object: what was written.")
 def set_value(words: tuple[str, ...], plant: str | None, output: Renderer) -> None:

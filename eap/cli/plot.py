@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from eap.cli.completion import complete_station, complete_variables
 from eap.cli.output import repaint, write_view
 from eap.cli.params import PLANT_FILE, examples
 
@@ -32,8 +33,8 @@ _LEAST_ROWS = 4
         "eapctl plot island-01 temp",
     )
 )
-@click.argument("source", metavar="FILE|STATION")
-@click.argument("variables", nargs=-1, metavar="[VAR]...")
+@click.argument("source", metavar="FILE|STATION", shell_complete=complete_station)
+@click.argument("variables", nargs=-1, metavar="[VAR]...", shell_complete=complete_variables)
 @click.option(
     "--with",
     "others",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from eap.cli.completion import complete_variables
 from eap.cli.output import Column, Renderer, TextTable
 from eap.cli.params import examples, json_option, plant_option
 from eap.quantities import count, duration
@@ -73,7 +74,7 @@ def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -
         "eapctl record start --to postgresql://logger@db.example/plant",
     ),
 )
-@click.argument("patterns", nargs=-1, metavar="[PATTERN]...")
+@click.argument("patterns", nargs=-1, metavar="[PATTERN]...", shell_complete=complete_variables)
 @click.option(
     "-o",
     "--out",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from eap.cli.completion import complete_station
 from eap.cli.group import ExitCode, LazyGroup
 from eap.cli.output import Renderer, write_text
 from eap.cli.params import ANSWER_MARGIN_S, examples, json_option, plant_option
@@ -69,7 +70,7 @@ def is_terminal() -> bool:
 
 
 @click.command("list", short_help="List routes and connections.")
-@click.argument("station", required=False, metavar="[STATION]")
+@click.argument("station", required=False, metavar="[STATION]", shell_complete=complete_station)
 @click.option(
     "--match",
     default="",
@@ -92,7 +93,7 @@ def list_all(station: str | None, match: str, plant: str | None, output: Rendere
 
 
 @click.command(short_help="Add a persistent route.")
-@click.argument("station")
+@click.argument("station", shell_complete=complete_station)
 @click.argument("name")
 @click.argument("net_id", required=False, default="", metavar="[NETID]")
 @click.option(
@@ -163,7 +164,7 @@ def add(
 
 
 @click.command(short_help="Remove a route that was added.")
-@click.argument("station")
+@click.argument("station", shell_complete=complete_station)
 @click.argument("route")
 @click.option(
     "--transport",
@@ -194,7 +195,7 @@ def remove(
 
 
 @click.command(short_help="Test routes and measure round trips.")
-@click.argument("station", required=False, metavar="[STATION]")
+@click.argument("station", required=False, metavar="[STATION]", shell_complete=complete_station)
 @click.argument("targets", nargs=-1, metavar="[TARGET]...")
 @click.option(
     "--timeout",
@@ -260,7 +261,7 @@ def _test(station: str, target: str, timeout_ms: int, plant: str | None) -> Test
 
 
 @click.command("import", short_help="Add the routes of a StaticRoutes file.")
-@click.argument("station")
+@click.argument("station", shell_complete=complete_station)
 @click.argument("file", type=_FILE)
 @click.option("--dry-run", is_flag=True, help="Show the routes, but add none.")
 @plant_option
@@ -297,7 +298,7 @@ def import_routes(
 
 
 @click.command(short_help="Write the routes of a station as a StaticRoutes file.")
-@click.argument("station")
+@click.argument("station", shell_complete=complete_station)
 @click.argument("file", type=_FILE, required=False, metavar="[FILE]")
 @plant_option
 def export(station: str, file: Path | None, plant: str | None) -> None:
@@ -341,7 +342,7 @@ def _read(file: Path) -> str:
         "eapctl routes add-remote island-01 192.168.1.5 --user Administrator --password-file pw",
     ),
 )
-@click.argument("station")
+@click.argument("station", shell_complete=complete_station)
 @click.argument("address")
 @click.option(
     "--name", default="", metavar="NAME", help="Name of the route there; STATION without."
@@ -416,7 +417,7 @@ def _password(user: str, file: Path | None) -> str:
     short_help="Discover the routers of other hosts, and add temporary routes.",
     epilog=examples("eapctl routes scan", "eapctl routes scan island-01 --address 192.168.1.5"),
 )
-@click.argument("station", required=False, metavar="[STATION]")
+@click.argument("station", required=False, metavar="[STATION]", shell_complete=complete_station)
 @click.option(
     "--address",
     default="",

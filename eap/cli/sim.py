@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from eap.cli.completion import complete_bus
 from eap.cli.group import LazyGroup
 from eap.cli.output import Renderer, write_json
 from eap.cli.params import CommandT, StationBus, examples, json_option, parse_port, plant_option
@@ -117,7 +118,9 @@ def parse_value(text: str) -> bool | int | float | str:
 
 
 def _place_argument(command: CommandT) -> CommandT:
-    return click.argument("bus", callback=_to_port, metavar="STATION/PORT")(command)
+    return click.argument(
+        "bus", callback=_to_port, metavar="STATION/PORT", shell_complete=complete_bus
+    )(command)
 
 
 def _to_port(ctx: click.Context, param: click.Parameter, text: str) -> StationBus:
