@@ -21,6 +21,7 @@ from eap.live.transport import UnixConnection
 from eap.runtime.bridges import BridgeFile
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import BridgeHandover
+from eap.runtime.log import start_logging
 from eap.runtime.startup import Startup
 
 _ORPHAN_S = 1.0
@@ -45,7 +46,7 @@ def run_bridge(
             pause, and ``status`` has the reason.
     """
     handover = BridgeHandover.from_descriptor(descriptor)
-    logging.basicConfig(format=f"{handover.name}: %(message)s", level=logging.INFO)
+    start_logging(handover.name)
     section = msgspec.json.decode(handover.section, type=kind, dec_hook=decode_value)
     folder = ApplianceFolder(Path(handover.folder))
     startup.step(f"starting {handover.name}")

@@ -598,6 +598,15 @@ def _blank_options(command: CommandT) -> CommandT:
     help="SCHED_FIFO priority of the engine.",
 )
 @click.option("--cpu", type=click.IntRange(0), metavar="N", help="Run the engine on this CPU only.")
+@click.option(
+    "--log",
+    "log",
+    type=click.Choice(("auto", "text", "json", "journal")),
+    default="auto",
+    show_default=True,
+    help="Form of the log on stderr; journal sends entries with fields to journald, which auto does"
+    " under systemd.",
+)
 @click.pass_context
 def run(
     ctx: click.Context,
@@ -607,6 +616,7 @@ def run(
     realtime: bool,
     priority: int,
     cpu: int | None,
+    log: str,
     blank: str | None,
     interface: str | None,
     net_id: str | None,
@@ -629,12 +639,15 @@ def run(
 
     # Processes and sockets: imported here, so that --help does not wait for them.
     from eap.supervisor import process as supervisor
+    from eap.supervisor.log_output import LogForm
 
     options = EngineOptions(realtime=realtime, priority=priority, cpu=-1 if cpu is None else cpu)
     if plant is not None:
-        ctx.exit(supervisor.run(plant, stations, host=host, options=options))
+        form = LogForm(log)
+        ctx.exit(supervisor.run(plant, stations, host=host, options=options, log=form))
     station = _blank_plant(blank or "", interface or "", net_id or "", cycle_us or DEFAULT_CYCLE_US)
-    ctx.exit(supervisor.run_blank(station, options=options, resume=resume))
+    form = LogForm(log)
+    ctx.exit(supervisor.run_blank(station, options=options, resume=resume, log=form))
 
 
 def _check_form(ctx: click.Context) -> None:

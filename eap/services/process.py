@@ -40,6 +40,7 @@ from eap.runtime.handover import (
     Handover,
     PortName,
 )
+from eap.runtime.log import start_logging
 from eap.runtime.recordings import recording_findings
 from eap.runtime.startup import Startup, Step, no_step
 from eap.runtime.store import StationStore, plant_folder
@@ -532,7 +533,7 @@ def main(handover_fd: int, startup: Startup) -> int:
     if handover.options.realtime:
         realtime.raise_process_priority()
     log = LimitedLogHandler()
-    logging.basicConfig(format="services: %(message)s", level=logging.INFO, handlers=[log])
+    start_logging("services", log)
     try:
         with ExitStack() as resources:
             asyncio.run(Services(handover, startup, log, resources).run())

@@ -1,7 +1,7 @@
 """Child processes of the supervisor: start, progress of the start, output, end and restart.
 
-Nothing in this module waits: the supervisor watches the descriptors given out here, and lines for
-stderr are dropped and counted while their reader is slow.  A terminal can be held (Ctrl-S), and the
+Nothing in this module waits: the supervisor watches the descriptors given out here, and log lines
+are dropped and counted while their reader is slow.  A terminal can be held (Ctrl-S), and the
 reader of a pipe may sleep.  A supervisor that waited for it could not restart a process, and
 services, whose lines pass through the supervisor, would stop with it.
 
@@ -13,9 +13,7 @@ the first limit.
 
 from __future__ import annotations
 
-import logging
 import os
-import select
 import signal
 import subprocess
 import sys
@@ -29,6 +27,7 @@ import msgspec
 
 from eap.runtime.handover import InheritedRecord
 from eap.runtime.startup import Report
+from eap.supervisor.log_output import LOG
 
 FIRST_LIMIT_NS = 20_000_000_000
 """Without progress, in the first start and behind one that succeeded."""
@@ -123,69 +122,6 @@ class StartWatch:
     @property
     def _deadline_ns(self) -> int:
         return self._progress_ns + self.limit_ns
-
-
-_PIECE = select.PIPE_BUF
-"""Bytes that a descriptor ready for writing takes at once."""
-
-
-class Output:
-    """Lines to a descriptor; those that it does not take now are dropped and counted.
-
-    Args:
-        fd: Where lines go.
-
-    Attributes:
-        dropped: How many, since the last line that was taken.
-    """
-
-    def __init__(self, fd: int) -> None:
-        self.dropped = 0
-        self._is_cut = False
-        self._fd = fd
-        self._poll = select.poll()
-        self._poll.register(fd, select.POLLOUT)
-
-    def write(self, line: str) -> None:
-        """Write a line, behind a note on those that were left out before it."""
-        if self.dropped:
-            line = f"({self.dropped} lines dropped here: the reader was too slow)\n{line}"
-        if self._is_cut:  # a full pipe or disk took a part of the line before: it ends there
-            line = f"\n{line}"
-        octets = f"{line}\n".encode("utf-8", "replace")
-        for start in range(0, len(octets), _PIECE):
-            piece = octets[start : start + _PIECE]
-            taken = self._take(piece)
-            if taken < len(piece):
-                self.dropped += 1
-                if written := octets[: start + taken]:
-                    self._is_cut = not written.endswith(b"\n")
-                return
-        self.dropped = 0
-        self._is_cut = False
-
-    def _take(self, octets: bytes) -> int:
-        """Write without waiting; return the number of bytes written."""
-        # Not O_NONBLOCK: that flag belongs to the open file, which the shell and other programs
-        # share.
-        if not self._poll.poll(0):
-            return 0
-        try:
-            return os.write(self._fd, octets)
-        except OSError:  # the reader has gone, or the disk is full
-            return 0
-
-
-STDERR = Output(2)
-"""Of this process."""
-
-
-class OutputHandler(logging.Handler):
-    """Log lines of the supervisor itself."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Write one."""
-        STDERR.write(self.format(record))
 
 
 FIRST_BACKOFF_NS = 100_000_000
@@ -329,8 +265,8 @@ class Child:
             os.close(self.error_fd)
             self.error_fd = -1
         for line in lines:
-            self._last_lines.append(line.decode("utf-8", "replace"))
-            STDERR.write(self._last_lines[-1])
+            text = LOG.pass_on(self.name, line.decode("utf-8", "replace"))
+            self._last_lines.append(text)
         return bool(data)
 
     def send_signal(self, number: signal.Signals) -> None:

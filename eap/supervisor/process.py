@@ -43,7 +43,8 @@ from eap.runtime.handover import (
 from eap.runtime.socket_plan import require_own_buses
 from eap.runtime.startup import catch_end_signals
 from eap.runtime.store import StationStore, adopt_plant_file, effective
-from eap.supervisor.child import Child, OutputHandler, StartEvent, describe_end
+from eap.supervisor.child import Child, StartEvent, describe_end
+from eap.supervisor.log_output import LOG, LogForm, LogHandler
 from eap.supervisor.optional import missing_extra, optional_processes
 from eap.supervisor.part import load_part
 from eap.supervisor.service_manager import CycleProgress, ServiceManager
@@ -70,6 +71,7 @@ def run(
     *,
     host: str = "",
     options: EngineOptions = EngineOptions(),  # noqa: B008  frozen
+    log: LogForm = LogForm.AUTO,
 ) -> int:
     """Run the plant in *plant_file*, or only some of its *stations*, until a stop signal.
 
@@ -83,6 +85,7 @@ def run(
         EnvironmentalError: this machine lacks something that the plant needs.
     """
     plant, own = load_part(plant_file, stations, host)
+    LOG.begin(log, plant.name)
     require_own_buses(plant.stations)
     subset = [station.name for station in plant.stations] if stations or own else []
     info = make_info(plant.name, str(plant_file.resolve()), plant.stations)
@@ -91,12 +94,15 @@ def run(
         return _run(info, plant, folder, options)
 
 
-def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> int:
+def run_blank(
+    plant: Plant, *, options: EngineOptions, resume: bool = False, log: LogForm = LogForm.AUTO
+) -> int:
     """Run *plant*, which no file describes, until a stop signal.
 
     Its stations start in PreOp, as *plant* has them or, with *resume*, as they were configured
     last, in the state that was requested then.  Returns and raises as ``run`` does.
     """
+    LOG.begin(log, plant.name)
     info = make_info(plant.name, "", plant.stations)
     with _claim(folder_name(plant.name)) as folder:
         for station in plant.stations:
@@ -112,9 +118,7 @@ def run_blank(plant: Plant, *, options: EngineOptions, resume: bool = False) -> 
 
 
 def _claim(folder: str) -> ApplianceFolder:
-    logging.basicConfig(
-        format="supervisor: %(message)s", level=logging.INFO, handlers=[OutputHandler()]
-    )
+    logging.basicConfig(level=logging.INFO, handlers=[LogHandler()])
     raise_descriptor_limit()
     return ApplianceFolder.claim(folder)
 

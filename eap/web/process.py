@@ -24,6 +24,7 @@ from eap.live.client import LiveClient
 from eap.live.view import LiveView
 from eap.runtime.durable import whole_file
 from eap.runtime.handover import WebHandover
+from eap.runtime.log import start_logging
 from eap.runtime.startup import Startup
 from eap.runtime.store import plant_folder
 from eap.web.metrics import PATH, MetricsServer
@@ -39,7 +40,7 @@ def main(descriptor: int, startup: Startup) -> int:
     """Serve page or metrics of an appliance until SIGTERM, or until its supervisor ends."""
     handover = WebHandover.from_descriptor(descriptor)
     section = handover.web or handover.metrics or WebSection()
-    logging.basicConfig(format=f"{section.KEY}: %(message)s", level=logging.INFO)
+    start_logging(section.KEY)
     startup.step(f"opening the port of {section.KEY}")
     try:
         listener = open_listener(section)

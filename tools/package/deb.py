@@ -103,8 +103,14 @@ def debian_version(version: str) -> str:
 def _install(wheel: Path, library: Path) -> None:
     """Install *wheel* with its dependencies for the Python of this Debian."""
     extras = ",".join(name for name in _extras(wheel) if name not in LEFT_OUT)
-    command = [sys.executable, "-m", "pip", "--python", PYTHON, "install", "--quiet"]
-    options = ["--disable-pip-version-check", "--no-compile", "--only-binary=:all:", "--target"]
+    command = [sys.executable, "-m", "pip", "--python", PYTHON, "install", "-qq"]
+    options = [
+        "--disable-pip-version-check",
+        "--root-user-action=ignore",
+        "--no-compile",
+        "--only-binary=:all:",
+        "--target",
+    ]
     subprocess.run([*command, *options, str(library), f"{wheel.resolve()}[{extras}]"], check=True)
     shutil.rmtree(library / "bin", ignore_errors=True)
     for each in library.glob("*.dist-info"):

@@ -17,12 +17,12 @@ from eap.supervisor.child import (
     FIRST_LIMIT_NS,
     LONGEST_LIMIT_NS,
     Child,
-    Output,
     RestartPolicy,
     StartEvent,
     StartWatch,
     describe_end,
 )
+from eap.supervisor.log_output import Output
 from tests.support.limits import largest_file
 
 SECOND_NS = 1_000_000_000
