@@ -22,7 +22,7 @@ _PACKAGES = "adduser,logrotate,python3,systemd"
 _UNSHARE = ("unshare", "--mount", "--net", "--uts", "--ipc", "--cgroup", "--pid", "--fork")
 _BOOT = """
 set -e
-mount --bind . . && cd .
+mount --bind "$PWD" "$PWD" && cd "$PWD"
 mount -t proc proc proc
 mount -t sysfs sysfs sys
 mount -t tmpfs tmpfs run
@@ -101,9 +101,8 @@ class DebianRoot(Closeable):
             if done.stdout.strip() in {"running", "degraded"}:
                 return self
             if self._holder.poll() is not None or time.monotonic() > deadline_s:
-                assert self._holder.stderr is not None
-                self.close()
-                reason = self._holder.stderr.read().strip() or done.stdout + done.stderr
+                self._holder.kill()
+                reason = self._holder.communicate()[1].strip() or done.stdout + done.stderr
                 pytest.skip(f"systemd does not start in a namespace here: {reason[-300:]}")
             time.sleep(0.2)
 
@@ -116,7 +115,7 @@ class DebianRoot(Closeable):
         enter = ["nsenter", "--target", inner[0], "--mount", "--net", "--pid", "--ipc", "--uts"]
         path = "PATH=/usr/sbin:/usr/bin:/sbin:/bin"
         return subprocess.run(
-            [*enter, f"--root={self.folder}", "--wd=/", "env", "-i", path, "sh", "-c", command],
+            [*enter, "--root", "--wd", "env", "-i", path, "sh", "-c", command],
             capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL, timeout=600,
         )  # fmt: skip
 
@@ -143,4 +142,4 @@ class DebianRoot(Closeable):
     def close(self) -> None:
         """End all processes."""
         self._holder.kill()
-        self._holder.wait()
+        self._holder.communicate()

@@ -25,12 +25,11 @@ from eap.runtime.store import StationStore, Stored, digest_of
 from eap.supervisor.child import Child
 from eap.supervisor.process import (
     Supervisor,
-    find_build_errors,
     make_info,
     run,
-    with_stored_configuration,
 )
 from eap.supervisor.sockets import SharedSockets
+from eap.supervisor.stored_start import find_build_errors, with_stored_configuration
 from tests.support.eventually import wait_until
 from tests.unit.eap.conftest import eap_port, left, right
 
