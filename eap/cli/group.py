@@ -188,6 +188,7 @@ _COMMANDS = {
     "import": ("files:import_files", "Make a plant file of TwinCAT, ENI and ESI files."),
     "inventory": ("inventory:inventory", "Print the hosts of a plant file for Ansible."),
     "keys": ("keys:keys", "Make and change keys of signed process data."),
+    "log": ("log:log", "Show or set the log levels of running plants."),
     "new": ("plant:new", "Write a plant file to start from."),
     "od": ("od:od", "Read and write the object dictionary of a device."),
     "pd": ("pd:pd", "List, watch and set the process data of running stations."),

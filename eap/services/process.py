@@ -52,6 +52,7 @@ from eap.services.control.control_ads import ControlAds, RemoteControl
 from eap.services.control.control_server import ControlServer
 from eap.services.control.device_methods import DeviceMethods
 from eap.services.control.field_methods import FieldMethods
+from eap.services.control.log_methods import LogMethods
 from eap.services.control.methods import Methods
 from eap.services.control.route_methods import AmsMethods, RouteMethods, RoutingMethods
 from eap.services.control.status import (
@@ -475,6 +476,7 @@ class Services:
             **AmsMethods(
                 devices.routers, self._directory, sockets.ams_address, deny_control
             ).table(),
+            **LogMethods().table(),
         }
 
     def _audit(self, routers: Mapping[str, StationRouter]) -> Audit:

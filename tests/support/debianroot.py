@@ -18,8 +18,15 @@ import pytest
 from eap.closeable import Closeable
 
 _PACKAGES = "adduser,logrotate,python3,systemd"
-# Namespaces of all kinds but user: systemd wants to be root.
-_UNSHARE = ("unshare", "--mount", "--net", "--uts", "--ipc", "--cgroup", "--pid", "--fork")
+# A control group of its own: the systemd of this machine, and others in tests, have theirs.
+_BEGIN = """
+set -e
+mount -t cgroup2 none mnt
+mkdir mnt/eap-test-$$
+echo $$ > mnt/eap-test-$$/cgroup.procs
+umount mnt
+exec unshare --mount --net --uts --ipc --cgroup --pid --fork --kill-child sh -c "$0"
+"""
 _BOOT = """
 set -e
 mount --bind "$PWD" "$PWD" && cd "$PWD"
@@ -32,6 +39,10 @@ mountpoint -q sys/fs/cgroup && umount -l sys/fs/cgroup
 mount -t cgroup2 none sys/fs/cgroup
 ip link set lo up
 container=test exec chroot . /lib/systemd/systemd --unit=multi-user.target
+"""
+_END = """
+mount -t cgroup2 none mnt
+find mnt/eap-test-$0 -depth -type d -exec rmdir {} +
 """
 _BOOT_S = 120
 
@@ -85,7 +96,7 @@ class DebianRoot(Closeable):
         for unit in ("getty.target", "systemd-resolved.service", "systemd-networkd.service"):
             (folder / "etc/systemd/system" / unit).symlink_to("/dev/null")
         self._holder = subprocess.Popen(
-            [*_UNSHARE, "--kill-child", "sh", "-c", _BOOT],
+            ["unshare", "--mount", "sh", "-c", _BEGIN, _BOOT],
             cwd=folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -143,3 +154,7 @@ class DebianRoot(Closeable):
         """End all processes."""
         self._holder.kill()
         self._holder.communicate()
+        subprocess.run(
+            ["unshare", "--mount", "sh", "-c", _END, str(self._holder.pid)],
+            cwd=self.folder, check=False, stdin=subprocess.DEVNULL,
+        )  # fmt: skip

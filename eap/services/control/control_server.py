@@ -65,7 +65,7 @@ _CHANGES = frozenset(
         *("write", "stop", "od_write", "request_state", "apply", "rollback"),
         *("bus_bring", "bus_fault", "bus_forget", "bus_transfer", "gateway_start", "gateway_stop"),
         *("routes_add", "routes_remove", "routes_import", "routes_add_remote"),
-        *("routing_apply", "routing_rollback"),
+        *("routing_apply", "routing_rollback", "set_log_level"),
     )
 )
 _HIDDEN = frozenset(("password", "spec", "xml", "routing"))
