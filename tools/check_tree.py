@@ -23,6 +23,7 @@ from typing import NamedTuple
 TOP_LEVEL = frozenset(
     {
         ".ci",
+        ".github",
         ".gitignore",
         "CHANGELOG.md",
         "CONTRIBUTING.md",
@@ -117,7 +118,7 @@ def _walk(root: Path) -> list[PurePosixPath]:
 
 
 def _is_generated(part: str) -> bool:
-    if part in {".ci", ".gitignore"}:
+    if part in {".ci", ".github", ".gitignore"}:
         return False
     return (
         part.startswith(".")

@@ -22,9 +22,9 @@ DIST = Path(__file__).parents[2] / "dist"
 CAPABILITIES = 1 << 13 | 1 << 14 | 1 << 23
 """CAP_NET_RAW, CAP_IPC_LOCK, CAP_SYS_NICE."""
 EXPECTED_LEFT = re.compile(
-    r"/var/(log|cache|lib/(dpkg|apt|systemd))/.*|/etc/(passwd|group|shadow|gshadow|subuid|subgid)-"
+    r"/var/(log|cache|lib/(dpkg|apt|systemd|logrotate))/.*|/etc/(passwd|group|shadow|gshadow|subuid|subgid)-"
 )
-"""Records of dpkg, apt and adduser themselves."""
+"""Records of dpkg, apt, adduser and logrotate themselves."""
 
 pytestmark = [pytest.mark.net, pytest.mark.timeout(900)]
 

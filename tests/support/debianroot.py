@@ -42,7 +42,10 @@ container=test exec chroot . /lib/systemd/systemd --unit=multi-user.target
 """
 _END = """
 mount -t cgroup2 none mnt
-find mnt/eap-test-$0 -depth -type d -exec rmdir {} +
+for attempt in 1 2 3 4 5 6 7 8 9 10; do  # killed processes take a moment to end
+    find mnt/eap-test-$0 -depth -type d -exec rmdir {} + 2>/dev/null && break
+    sleep 0.2
+done
 """
 _BOOT_S = 120
 

@@ -1,4 +1,4 @@
-"""Methods of the control protocol for log levels; a restart of services brings them back to info."""
+"""Methods of the control protocol for log levels; a restart of services resets them to info."""
 
 from __future__ import annotations
 
