@@ -75,7 +75,7 @@ class ServiceManager(Closeable):
 
 
 class CycleProgress:
-    """Whether the engine runs cycles, seen by the counter of one station in its process image.
+    """Progress of the engine, seen by the cycle counter of one station in its process image.
 
     Args:
         image: The station's.

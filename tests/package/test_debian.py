@@ -51,11 +51,11 @@ def before(debian: DebianRoot) -> set[str]:
 
 
 def install(debian: DebianRoot, package: Path) -> str:
-    shutil.copyfile(package, debian.folder / "root" / "package.deb")
+    shutil.copyfile(package, debian.folder / "opt/package.deb")
     try:
-        return debian.run("apt-get install -y --no-install-recommends /root/package.deb 2>&1")
+        return debian.run("apt-get install -y --no-install-recommends /opt/package.deb 2>&1")
     finally:
-        (debian.folder / "root/package.deb").unlink()
+        (debian.folder / "opt/package.deb").unlink()
 
 
 def status(debian: DebianRoot) -> dict:
