@@ -420,6 +420,9 @@ def full_view(document: StatusReport, now_s: float) -> Iterator[RenderableType]:
         if listeners := appliance.listeners:
             yield ""
             yield _listeners(listeners)
+        if any(each.get("bridge") for each in appliance.processes.values()):
+            yield ""
+            yield _bridges(appliance)
     yield ""
     yield _stations_table(stations)
     if any("bus" in port for station in stations for port in station["ports"]):
@@ -470,6 +473,35 @@ def _processes_table(appliance: ApplianceStatus) -> TextTable:
 
 def _descriptors(descriptors: Row | None) -> str:
     return "" if descriptors is None else f"{descriptors['used']} of {descriptors['limit']}"
+
+
+def _bridges(appliance: ApplianceStatus) -> TextTable:
+    """Return bridges, and the controllers that they read."""
+    table = TextTable(
+        "Bridge",
+        "Peer",
+        "State",
+        Column("Clients", rank=2, is_number=True),
+        Column("Sent", rank=1, is_number=True),
+        Column("Received", rank=1, is_number=True),
+        Column("Failed", is_number=True),
+    )
+    for name, process in appliance.processes.items():
+        if not (bridge := process.get("bridge")):
+            continue
+        if bridge["peer"]:
+            clients = "" if bridge["clients"] is None else str(bridge["clients"])
+            counts = (str(bridge[key]) for key in ("sent", "received", "refused"))
+            table.add_row(name, bridge["peer"], _peer_state(bridge), clients, *counts)
+        for peer in bridge.get("peers", ()):
+            failed = f"{peer['failed']} of {peer['values']}"
+            label, sent = f"{name} {peer['name']}", str(peer["writes"])
+            table.add_row(label, peer["url"], _peer_state(peer), "", sent, "", failed)
+    return table
+
+
+def _peer_state(row: Row) -> str | Styled:
+    return "up" if row["is_up"] else Styled("down", style=_BAD)
 
 
 def _listeners(listeners: Sequence[Row]) -> TextTable:

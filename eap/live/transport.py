@@ -170,6 +170,7 @@ class UnixConnection:
         for answer in self._waiting.values():
             if not answer.done():
                 answer.set_exception(self._error)
+                answer.exception()  # so that asyncio does not miss a requester just cancelled
         for watch in self._watches.values():
             watch.end(self._error)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import socket
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -45,7 +46,8 @@ def open_server(listen: str) -> socket.socket:
             f" unit, or listen on another port"
         ) from None
     except OSError as exc:
-        raise EnvironmentalError(f"{listen}: {exc.strerror}") from None
+        # strerror has the address again.
+        raise EnvironmentalError(f"{listen}: {os.strerror(exc.errno or 0)}") from None
 
 
 class FieldServing:
@@ -129,6 +131,8 @@ class FieldServing:
         self._bridge.status.clients = self._hosts.total()
         try:
             await self._serve(host, reader, writer)
+        except asyncio.CancelledError:
+            pass  # the bridge ends; asyncio logs handlers that say so
         except TimeoutError:
             logger.info("%s: disconnected: too slow", host)
         except (CodecError, OSError) as exc:

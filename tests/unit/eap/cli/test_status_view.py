@@ -191,3 +191,16 @@ def test_frames_to_a_net_id() -> None:
 
 def test_frames_without_more_than_their_pds_have_no_table() -> None:
     assert "Subscriber" not in show(document(frames=[frame("to-panel")]))
+
+
+def test_bridges_and_their_controllers_are_shown() -> None:
+    status = document()
+    bridge = {"peer": "s7://127.0.0.1:102", "is_up": True, "reason": "", "since": 0.0,
+              "clients": 2, "sent": 90, "received": 7, "refused": 1, "dropped": 0}  # fmt: skip
+    press = {"name": "press", "url": "s7://10.0.0.9:102", "is_up": False, "reason": "no route",
+             "writes": 5, "values": 12, "failed": 3}  # fmt: skip
+    status["processes"]["s7"] = {"pid": 103, "bridge": bridge | {"peers": [press]}}
+    text = show(status)
+    assert row_of(text, "s7  ") == "s7 103"
+    assert row_of(text, "127.0.0.1:102") == "s7 s7://127.0.0.1:102 up 2 90 7 1"
+    assert row_of(text, "s7 press") == "s7 press s7://10.0.0.9:102 down 5 3 of 12"
