@@ -36,13 +36,18 @@ HOST_VARIABLE = "EAP_HOST"
 @click.option(
     "--schema", is_flag=True, help="Instead: print the JSON Schema of plant files, for editors."
 )
+@click.option(
+    "--security", is_flag=True, help="Also list what the plant leaves open to other hosts."
+)
 @json_option("Print one object: ok, all findings, and warnings.")
 @click.pass_context
-def check(ctx: click.Context, file: Path | None, schema: bool, output: Renderer) -> None:
+def check(
+    ctx: click.Context, file: Path | None, schema: bool, security: bool, output: Renderer
+) -> None:
     """Check the plant file or bus file FILE and report all errors.
 
-    Exits with 2 when there is an error.  A warning names a part that runs but that some commands do
-    not support.
+    Exits with 2 when there is an error, with 1 when --security finds something open.  A warning
+    names a part that runs but that some commands do not support.
     """
     if schema:
         if file is not None:
@@ -55,12 +60,14 @@ def check(ctx: click.Context, file: Path | None, schema: bool, output: Renderer)
         raise click.UsageError("nothing to check: give FILE, or --schema", ctx)
     from eap.ops.check import CheckedBus, check_file  # yaml; --help must not wait
 
-    checked = check_file(file)
+    checked = check_file(file, security=security)
     found = checked.report
     for warning in found.warnings:
         output.remark(f"warning: {warning}")
     for finding in found.findings:
         output.remark(str(finding))
+    for exposure in found.security or ():
+        output.remark(f"open: {exposure}")
     if len(found.findings) > 1:
         what = "bus" if isinstance(checked, CheckedBus) else "plant"
         output.remark(
@@ -69,6 +76,8 @@ def check(ctx: click.Context, file: Path | None, schema: bool, output: Renderer)
     output.show(found, lambda _: _summary(file, checked))
     if found.findings:
         ctx.exit(ExitCode.UNUSABLE)
+    if found.security:
+        ctx.exit(ExitCode.FAILED)
 
 
 def _summary(file: Path, checked: CheckedPlant | CheckedBus) -> Iterator[str]:

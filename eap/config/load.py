@@ -47,6 +47,7 @@ from eap.config.bus import (
 from eap.config.document import convert, read, read_net_id
 from eap.config.eoe import check_eoe, eoe_spec
 from eap.config.exchange import check_polls, check_publish, check_subscribe
+from eap.config.exposure import Exposure, find_exposures
 from eap.config.field import check_field, field_bridge_on, field_bridges, resolved_source
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.hosts import check_hosts, is_served_on
@@ -550,6 +551,8 @@ class PlantResult(msgspec.Struct, frozen=True):
     """Warnings about a plant that is valid."""
     types: TypeTable | None = None
     """Types that a valid plant defines."""
+    exposures: tuple[Exposure, ...] = ()
+    """Places that a valid plant leaves open to other hosts."""
 
 
 def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> PlantResult:
@@ -611,8 +614,8 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
         *warn_of_commands(index, report),
         *warn_of_open_channels(index, report),
     )
-
-    return PlantResult(plant, (), report.lines, warnings, types)
+    exposures = find_exposures(index, report, path.parent)
+    return PlantResult(plant, (), report.lines, warnings, types, exposures)
 
 
 PORT = "eap0"

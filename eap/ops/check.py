@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from eap.config.document import kind_of, read
+from eap.config.exposure import Exposure
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.load import Plant
 from eap.device.eap_dictionary import EapDictionary
@@ -27,6 +29,8 @@ class CheckReport(msgspec.Struct, frozen=True):
     ok: bool
     findings: tuple[PlantFinding, ...]
     warnings: tuple[PlantFinding, ...]
+    security: tuple[Exposure, ...] | UnsetType = UNSET
+    """Places that it leaves open to other hosts, where that was asked for."""
 
 
 class CheckedPlant(NamedTuple):
@@ -43,9 +47,9 @@ class CheckedBus(NamedTuple):
     bus: BusFile | None
 
 
-def check_file(path: Path) -> CheckedPlant | CheckedBus:
-    """Check the plant file or bus file at *path*."""
-    checked = check_plant(path)
+def check_file(path: Path, *, security: bool = False) -> CheckedPlant | CheckedBus:
+    """Check a plant file or bus file; *security* also lists what a plant leaves open."""
+    checked = check_plant(path, security=security)
     # Read again only if it is not a plant without errors: large plants take seconds to read.
     return checked if checked.report.ok or not _is_bus(path) else _check_bus(path)
 
@@ -64,8 +68,8 @@ def _check_bus(path: Path) -> CheckedBus:
     )
 
 
-def check_plant(path: Path) -> CheckedPlant:
-    """Check the plant file at *path*."""
+def check_plant(path: Path, *, security: bool = False) -> CheckedPlant:
+    """Check the plant file at *path*; *security* also lists what it leaves open."""
     result = load_plant(path)
     if result.plant is None:
         return CheckedPlant(CheckReport(not result.findings, result.findings, ()), None)
@@ -77,7 +81,9 @@ def check_plant(path: Path) -> CheckedPlant:
             warnings.append(
                 PlantFinding(str(path), line, place, f"station {station.name}, {message}", expected)
             )
-    return CheckedPlant(CheckReport(True, (), (*warnings, *result.warnings)), result.plant)
+    exposures = result.exposures if security else UNSET
+    found = CheckReport(True, (), (*warnings, *result.warnings), exposures)
+    return CheckedPlant(found, result.plant)
 
 
 def _small_dictionaries(station: StationSpec) -> Iterator[tuple[str, str]]:
