@@ -102,7 +102,12 @@ def _to_remote(
     metavar="S",
     help="Seconds between refreshes.",
 )
-@click.option("--write", "may_write", is_flag=True, help="Allow changes of routes in their view.")
+@click.option(
+    "--write",
+    "may_write",
+    is_flag=True,
+    help="Allow changes of routes in their view, and recordings.",
+)
 @plant_option
 @json_option("Print one object for each station; docs/top.md explains its fields.")
 def top(
@@ -166,7 +171,7 @@ def run_app(
         model: What is chosen; all without it.
         tab: View to begin with.
         interval_s: Seconds between refreshes.
-        may_write: Whether routes may be changed.
+        may_write: Whether routes may be changed, and recordings be made.
         instead: Command without textual, for the message.
 
     Raises:
@@ -186,9 +191,10 @@ def run_app(
 
     view = live_view(plant, hosts)
     routes: RouteRequests = RemoteRouters(hosts) if hosts else RouterClient(plant or None)
-    refusal = "" if may_write else READ_ONLY
+    refusal = record_refusal = "" if may_write else READ_ONLY
     if hosts:
         refusal = "Routes of other hosts are changed there."
+        record_refusal = "Recordings are made on the host of the plant: eapctl record start"
     app = TopApp(
         view,
         model or TopModel(),
@@ -196,6 +202,7 @@ def run_app(
         tab=Tab(tab),
         period_s=interval_s,
         refusal=refusal,
+        record_refusal=record_refusal,
     )
     app.run()
 

@@ -34,6 +34,7 @@ MINUTE_NS = 60_000_000_000
 GONE = "gone"
 """State of a station whose appliance does not answer."""
 BARS = "▁▂▃▄▅▆▇█"
+_RECORDING = "recording "
 _LOSSY = "!"
 _SILENT = "·"
 _GOOD, _BAD, _WARN, _DIM = "green", "bold red", "yellow", "dim"
@@ -259,16 +260,25 @@ class TopModel:
         return "  ".join(parts)
 
     def findings_of(self, station: str, plant: str) -> list[tuple[str, str]]:
-        """Return the present faults of a station: texts with their styles."""
+        """Return the present faults of a station, then those of its appliance, with their styles.
+
+        *station* may be ``STATION/PORT``, which has its own only.
+        """
         if self.report is None:
             return []
         now_s = self.report.time
-        return [
-            (each.text(now_s), SEVERITY_STYLES[each.severity])
-            for each in self.report.status.findings
-            if each.plant == plant
-            and (each.where == station or each.where.startswith((f"{station}/", f"{station} ")))
-        ]
+        found = [each for each in self.report.status.findings if each.plant == plant]
+        chosen = [each for each in found if _is_of(station, each.where)]
+        if "/" not in station:
+            names = [str(each["name"]) for each in self.report.status.stations]
+            chosen += [
+                each
+                for each in found
+                if not any(_is_of(name, each.where) for name in names)
+                and (each.severity is not Severity.INFO or each.where.startswith(_RECORDING))
+            ]
+        rows = [(each.text(now_s), SEVERITY_STYLES[each.severity]) for each in chosen]
+        return list(dict.fromkeys(rows))  # two appliances of a plant report its recordings
 
     def station(self, row: StationRow | PdFlow | BusRow) -> Row | None:
         """Return the station of a row in the status document, None if it is gone."""
@@ -357,6 +367,10 @@ class TopModel:
     @staticmethod
     def _status(report: LiveReport | None) -> StatusReport | None:
         return None if report is None else report.status
+
+
+def _is_of(station: str, where: str) -> bool:
+    return where == station or where.startswith((f"{station}/", f"{station} "))
 
 
 def _sorted(rows: list[AnyRowT], key: str) -> list[AnyRowT]:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import pytest
 
+from eap.recording.recording_file import describe
 from tests.support.appliance import EAPCTL, Appliance, Plants, wait_until
 from tests.support.namespaces import Namespace, cable
 from tests.support.tmux import HAS_TMUX, Terminal, terminal
@@ -155,6 +156,24 @@ def test_cut_cable_of_a_bus_is_named_by_its_slaves(hall: Hall) -> None:
             hall.left.command(*cut, "--end")
         screen.press("1")
         begin(screen)
+
+
+def test_key_records_the_chosen_station_and_ends_that(hall: Hall) -> None:
+    with hall.top("--write", size=LARGE) as screen:
+        begin(screen)
+        screen.press("r")
+        screen.wait_for("Record values of left to FILE.mcap")
+        screen.press("C-u")
+        screen.press("-l", str(hall.farm.folder / "pressed"))
+        screen.press("Enter")
+        screen.wait_for("recording 'pressed': ", "The key r ends it.")
+        screen.press("Escape")
+        screen.wait_for("recording pressed: recording, ")  # among the details of the station
+        screen.press("r")
+        screen.wait_for("End recording 'pressed'", "pressed.mcap")
+        screen.press("y")
+        screen.wait_for("messages, none lost")
+    assert describe(hall.farm.folder / "pressed.mcap").finished
 
 
 def test_killed_appliance_is_waited_for(hall: Hall) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
+
 from eap.cli.routes_tui.table import RouterClient, RouteRequests
 from eap.cli.top_model import Tab, TopModel
 from eap.cli.top_tui.app import TopApp
@@ -43,8 +45,8 @@ class FakeView(LiveView):
         del within_s
         found = report(self._make(self._number), self._number, self.unreachable)
         self._number += 1
-        self.log.take(found.status, found.at_ns, found.time, found.unreachable)
-        return found
+        events = self.log.take(found.status, found.at_ns, found.time, found.unreachable)
+        return msgspec.structs.replace(found, events=events)
 
 
 def routes_app(requests: RouteRequests, period_s: float = NEVER_S, refusal: str = "") -> TopApp:
@@ -59,6 +61,6 @@ def routes_app(requests: RouteRequests, period_s: float = NEVER_S, refusal: str 
     )
 
 
-def top_app(make: Callable[[int], dict[str, Any]]) -> TopApp:
+def top_app(make: Callable[[int], dict[str, Any]], period_s: float = NEVER_S) -> TopApp:
     """Return the live view of reports that a test makes; a key refreshes it, see ``refresh``."""
-    return TopApp(FakeView(make), TopModel(), RouterClient(None), period_s=NEVER_S)
+    return TopApp(FakeView(make), TopModel(), RouterClient(None), period_s=period_s)

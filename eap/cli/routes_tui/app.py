@@ -58,7 +58,8 @@ class RoutesScreen(Screen[None]):
         Binding("e", "edit", "Edit"),
         Binding("d,delete", "remove", "Remove", key_display="d"),
         Binding("t,enter", "test", "Test", key_display="t"),
-        Binding("slash", "filter", "Filter", key_display="/"),
+        # With priority it is handled at once, so that the next keys are for the field.
+        Binding("slash", "filter", "Filter", key_display="/", priority=True),
         Binding("s", "station", "Station", show=False),  # the line of the views names these four
         Binding("r", "view('routes')", "Routes", show=False),
         Binding("c", "view('connections')", "Connections", show=False),
@@ -198,11 +199,16 @@ class RoutesScreen(Screen[None]):
         self._station = names[(at + 1) % len(names)]
         self._show()
 
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool:
+        """Return whether a key has its action: a slash in a field is a sign."""
+        del parameters
+        return action != "filter" or not isinstance(self.focused, Input)
+
     def action_filter(self) -> None:
         """Edit the filter of rows."""
         field = self.query_one("#filter", Input)
         field.display = True
-        field.focus()
+        self.set_focus(field)
 
     @on(Input.Changed, "#filter")
     def _apply_filter(self, event: Input.Changed) -> None:

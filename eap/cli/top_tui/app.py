@@ -22,7 +22,9 @@ from eap.pd.report import PdRow
 
 PERIODS_S = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 """Periods of refreshes that keys choose among."""
-READ_ONLY = "This view only shows: start it with --write to change routes."
+READ_ONLY = "This view only shows: start it with --write to change routes and to record."
+_LOOK_S = 0.5
+"""Period in which events are looked for, where the screen is refreshed less often."""
 
 
 class TopApp(App[None]):
@@ -35,7 +37,8 @@ class TopApp(App[None]):
         tab: View to begin with.
         period_s: Period of refreshes.
         routes_period_s: Period of requests of the view of routes.
-        refusal: Why nothing is changed here; empty if routes are.
+        refusal: Why no routes are changed here; empty if they are.
+        record_refusal: The same for recordings.
     """
 
     CSS_PATH = "style.tcss"
@@ -62,12 +65,13 @@ class TopApp(App[None]):
         period_s: float = 1.0,
         routes_period_s: float = 1.0,
         refusal: str = READ_ONLY,
+        record_refusal: str = READ_ONLY,
     ) -> None:
         super().__init__()
         self._live = view
         self._period_s = period_s
         self._first_tab = tab
-        self._overview = OverviewScreen(model, view.log.events)
+        self._overview = OverviewScreen(model, view.log.events, record_refusal)
         self._routes = RoutesScreen(routes, period_s=routes_period_s, refusal=refusal)
         self._model = model
         self._pds: dict[tuple[str, str], list[PdRow]] = {}
@@ -121,16 +125,22 @@ class TopApp(App[None]):
     @work
     async def _poll(self) -> None:
         clock = asyncio.get_running_loop().time
+        due_s = clock()
         while True:
             began_s = clock()
-            self._model.take(await self._live.take())
-            await self._read_values()
-            self._overview.refresh_rows()
+            report = await self._live.take()
+            # What happens is shown before the next refresh is due.
+            if began_s >= due_s or report.events:
+                self._model.take(report)
+                await self._read_values()
+                self._overview.refresh_rows()
+                due_s = began_s + self._period_s
             self._changed.clear()
-            left_s = began_s + self._period_s - clock()
+            next_s = min(due_s, began_s + max(_LOOK_S, self._period_s / 2))
             try:
-                async with asyncio.timeout(max(left_s, 0.02)):
+                async with asyncio.timeout(max(next_s - clock(), 0.02)):
                     await self._changed.wait()
+                due_s = clock()
             except TimeoutError:
                 continue
 

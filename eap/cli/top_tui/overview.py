@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from datetime import datetime
+from pathlib import Path
 from typing import ClassVar, TypeAlias
 
 from rich.text import Text
-from textual import on
+from textual import on, work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
@@ -14,6 +16,7 @@ from textual.screen import Screen
 from textual.widgets import DataTable, Footer, Input, Static
 
 from eap.cli.output import value_text
+from eap.cli.routes_tui.app import Message, Question
 from eap.cli.top_model import (
     COLUMNS,
     SEVERITY_STYLES,
@@ -26,10 +29,20 @@ from eap.cli.top_model import (
     sort_keys,
 )
 from eap.cli.top_tui.grid import Grid, GridColumn
+from eap.cli.top_tui.recording import (
+    RecordedThing,
+    RecordForm,
+    end_recording,
+    find_recording,
+    start_recording_of,
+    thing_of,
+)
+from eap.errors import EapError
 from eap.live.events import LiveEvent
 from eap.live.findings import Severity
 from eap.live.rows import BusRow, PdFlow, Row, StationRow
 from eap.quantities import duration
+from eap.runtime.recordings import RecordingState
 
 TABS = {
     Tab.STATIONS: "1 Stations",
@@ -51,16 +64,17 @@ HELP = """\
 1 to 5    stations, PDs, buses, routes, events; Tab goes on
 ↑ ↓       choose a row; its details are below the table
 Enter     the PDs of the chosen station; Esc goes back
-/         show rows that fit: a name, or KEY>NUMBER such as lost>0, age>5ms,
-          state!=OP, name=island*; several words are all required
+/         show rows that fit: a name, or KEY>NUMBER such as lost>0,
+          age>5ms, state!=OP, name=island*; all of several words
 < >       sort by the next column; o turns the order round
 space     pause: the screen stays as it is
-z Z       count lost and late from now on, on this screen; Z: from the start
+z Z       count lost and late from now on, here only; Z: from the start
+r         record the chosen station, PD or bus, or end that (--write)
 + -       refresh more often, less often
 ? F1      this help
 q         quit
 
-Last minute: a bar for the rate, ! for lost or late PDs, · for none at all.
+Last minute: a bar for the rate, ! for lost or late PDs, · for none.
 Left out columns: a wider terminal shows them."""
 
 
@@ -70,6 +84,7 @@ class OverviewScreen(Screen[None]):
     Args:
         model: Content.
         events: All events, the latest last.
+        record_refusal: Why nothing is recorded from here; empty if it is.
 
     Attributes:
         tab: View that is shown.
@@ -77,19 +92,24 @@ class OverviewScreen(Screen[None]):
     """
 
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("slash", "filter", "Filter", key_display="/"),
+        # With priority it is handled at once, so that the next keys are for the field.
+        Binding("slash", "filter", "Filter", key_display="/", priority=True),
         Binding("less_than_sign", "sort(-1)", "Sort", key_display="< >"),
         Binding("greater_than_sign", "sort(1)", "Sort", show=False),
         Binding("o", "reverse", "Order", show=False),
         Binding("z", "zero", "Zero"),
         Binding("Z", "total", "Total", show=False),
+        Binding("r", "record", "Record", show=False),
         Binding("space", "pause", "Pause", key_display="space"),
         Binding("tab", "next_tab", "Next view", show=False, priority=True),
         Binding("question_mark,f1", "app.help", "Help", key_display="?"),
     ]
 
-    def __init__(self, model: TopModel, events: Sequence[LiveEvent]) -> None:
+    def __init__(
+        self, model: TopModel, events: Sequence[LiveEvent], record_refusal: str = ""
+    ) -> None:
         super().__init__()
+        self._record_refusal = record_refusal
         self.tab = Tab.STATIONS
         self.values: dict[str, object] | str = {}
         self._model = model
@@ -276,11 +296,16 @@ class OverviewScreen(Screen[None]):
             self._set_match(f"station={line.row.name}")
             self.show_tab(Tab.PDS)
 
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool:
+        """Return whether a key has its action: a slash in a field is a sign."""
+        del parameters
+        return action != "filter" or not isinstance(self.focused, Input)
+
     def action_filter(self) -> None:
         """Edit the filter of rows."""
         field = self.query_one("#filter", Input)
         field.display = True
-        field.focus()
+        self.set_focus(field)
 
     @on(Input.Changed, "#filter")
     def _apply_filter(self, event: Input.Changed) -> None:
@@ -333,6 +358,49 @@ class OverviewScreen(Screen[None]):
         """Stop refreshing the screen, or go on."""
         self._is_paused = not self._is_paused
         self.show()
+
+    def action_record(self) -> None:
+        """Record what is chosen, or end its recording."""
+        if self._record_refusal:
+            self.app.push_screen(Message("Record", self._record_refusal))
+            return
+        thing = thing_of(self.chosen.row) if self.chosen is not None else None
+        if thing is None:
+            self.app.push_screen(Message("Record", "Choose a station, a PD or a bus first."))
+        else:
+            self._look_for_recording(thing)
+
+    @work(thread=True, exclusive=True)
+    def _look_for_recording(self, thing: RecordedThing) -> None:
+        state = find_recording(thing)
+        if state is None:
+            self.app.call_from_thread(self._ask_for_target, thing)
+        else:
+            self.app.call_from_thread(self._ask_to_end, state)
+
+    def _ask_for_target(self, thing: RecordedThing) -> None:
+        target = Path.cwd() / f"{thing.file_name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
+        self.app.push_screen(RecordForm(thing, target, start_recording_of), self._show_recording)
+
+    def _ask_to_end(self, state: RecordingState) -> None:
+        def answered(is_wanted: bool | None) -> None:
+            if is_wanted:
+                self._end_recording(state.name)
+
+        target = state.files[-1] if state.files else "no file yet"
+        self.app.push_screen(Question(f"End recording {state.name!r} ({target})?"), answered)
+
+    @work(thread=True)
+    def _end_recording(self, name: str) -> None:
+        try:
+            text = end_recording(name)
+        except EapError as exc:
+            text = str(exc)
+        self.app.call_from_thread(self._show_recording, text)
+
+    def _show_recording(self, text: str | None) -> None:
+        if text:
+            self.app.push_screen(Message("Record", text))
 
     def action_next_tab(self) -> None:
         """Show the next view."""

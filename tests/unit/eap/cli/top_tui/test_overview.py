@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 from typing import Any
 
 import pytest
 from textual.binding import Binding
+from textual.events import Key
 
 from eap.cli.top_tui.app import TopApp
 from eap.cli.top_tui.overview import OverviewScreen
@@ -112,6 +114,60 @@ def test_filter_shows_rows_that_fit_and_says_why_none_does() -> None:
         for key in ("l", "s", "t", "greater_than_sign", "0"):
             shown = await screen.press_key(key)
         assert "filter: no key 'lst', did you mean lost?" in shown
+
+    run(script)
+
+
+def test_keys_behind_the_slash_are_for_the_filter_however_fast() -> None:
+    async def script(screen: Screen) -> None:
+        await wait(screen, "mixer")
+        for key, sign in (("slash", "/"), ("z", "z"), ("greater_than_sign", ">"), ("2", "2")):
+            screen.app.post_message(Key(key, sign))
+        shown = await wait(screen, "Filter: z>2")
+        assert "since" not in shown.splitlines()[0]
+        assert "Last minute" in shown
+
+    run(script)
+
+
+def test_event_is_shown_before_the_next_refresh_is_due() -> None:
+    def report(second: int) -> dict[str, Any]:
+        found = plant(0)
+        found["stations"][1]["state"] = "OP" if second else "PREOP"
+        return found
+
+    async def script(screen: Screen) -> None:
+        await wait(screen, "1/2 OP")
+        began_s = asyncio.get_running_loop().time()
+        await wait(screen, "press: state PREOP → OP")
+        # At the first look; the first refresh is due after 10 s.
+        assert asyncio.get_running_loop().time() - began_s < 9
+
+    play(top_app(report, period_s=10.0), script, is_virtual=True)
+
+
+def test_faults_of_the_appliance_are_details_of_its_stations() -> None:
+    findings = [
+        {"severity": "warning", "where": "recording day", "what": "recording, 3 lost"},
+        {"severity": "info", "where": "recording night", "what": "armed, 3 variables"},
+        {"severity": "info", "where": "clock", "what": "of no concern"},
+    ]
+
+    async def script(screen: Screen) -> None:
+        shown = await wait(screen, "mixer  5.1.1.1.1.1")
+        assert "recording day: recording, 3 lost" in shown
+        assert "recording night: armed, 3 variables" in shown
+        assert "clock: of no concern" not in shown
+
+    found = plant(0)
+    found["appliances"][0]["findings"] = findings
+    play(top_app(lambda _: found), script, (80, 40), is_virtual=True)
+
+
+def test_view_that_only_shows_records_nothing() -> None:
+    async def script(screen: Screen) -> None:
+        await wait(screen, "mixer")
+        assert "start it with --write to change routes and to" in await screen.press_key("r")
 
     run(script)
 
