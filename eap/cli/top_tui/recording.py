@@ -21,7 +21,7 @@ from eap.runtime.recordings import RecordingState
 
 
 class RecordedThing(NamedTuple):
-    """What a row of the view is to a recorder: values of a station or a PD, frames of a port."""
+    """Values of a station or of a PD, or frames of a port, that a row of the view stands for."""
 
     plant: str
     pattern: str
@@ -34,7 +34,7 @@ class RecordedThing(NamedTuple):
 
 
 def thing_of(row: object) -> RecordedThing | None:
-    """Return what is recorded of a row, None if nothing is."""
+    """Return the values or frames of a row, None if it has none."""
     if isinstance(row, StationRow):
         return RecordedThing(row.plant, row.name)
     if isinstance(row, PdFlow):
@@ -56,7 +56,7 @@ def find_recording(thing: RecordedThing) -> RecordingState | None:
 
 
 def start_recording_of(thing: RecordedThing, target: Path) -> str:
-    """Start a recording and return what is recorded where; raises EapError if it cannot begin."""
+    """Start a recording and return a text about it; raises EapError if it cannot begin."""
     from eap.ops.recorders import start_recording
     from eap.recording.recorder import RecorderOptions
 
@@ -69,7 +69,7 @@ def start_recording_of(thing: RecordedThing, target: Path) -> str:
 
 
 def end_recording(name: str) -> str:
-    """End a recording and return what is in it; raises EapError if it has ended."""
+    """End a recording and return a text about it; raises EapError if it has ended."""
     from eap.ops.recorders import stop_recording
 
     state = stop_recording(name)
