@@ -42,6 +42,7 @@ PICTURE_PAGE = """\
             "#lamp": {of: island-02/temperature, warn: 1, alarm: 500}
             "#hand": {of: island-02/temperature, show: turn}
             "#off": {of: island-03/alarm, show: visible}
+        - {kind: trend, of: [island-02/temperature, island-02/pressure, island-03/position], window: 30s}
 """
 PICTURE = """\
 <svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 200 100" width="200" height="100">
@@ -207,6 +208,17 @@ def test_trend_is_read_by_keys(tab: Callable[..., Tab]):
     panel.get_by_role("button", name="Live").wait_for()
     page.keyboard.press("Escape")
     panel.get_by_role("button", name="Pause").wait_for()
+
+
+def test_trend_has_a_scale_for_each_unit(tab: Callable[..., Tab]):
+    page = tab().open("page/Picture")
+    panel = page.locator(".panel-trend")
+    panel.locator("canvas").wait_for()
+    assert panel.locator(".u-axis").count() == 3  # time, and two of three units
+    wait_for_change(panel.locator(".legend .number").first)
+    readings = panel.locator(".legend .number").all_text_contents()
+    assert re.fullmatch(r"1\d\d\.\d", readings[0])
+    assert re.fullmatch(r"1\.0\d+", readings[1])
 
 
 def test_curves_that_nobody_sees_are_bounded(tab: Callable[..., Tab]):

@@ -17,7 +17,7 @@ export function eventsPanel(panel, scope) {
   const { frame, body } = table(t("events"), [t("time"), t("severity"), t("where"), t("event")], { class: "events" });
   const rows = new Rows(body);
   const none = h("p", { class: "note" }, t("no_events"));
-  const choice = h("select", { class: "tool", "aria-label": t("events_from") }, LEVELS.map((each) => h("option", { value: each, selected: each === panel.from }, `${tn("severity", each)}`)));
+  const choice = h("select", { class: "tool", "aria-label": t("events_from") }, LEVELS.map((each) => h("option", { value: each, selected: each === panel.from }, tn("least", each))));
   let latest = [];
   const show = () => {
     const least = LEVELS.indexOf(choice.value);

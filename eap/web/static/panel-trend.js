@@ -12,6 +12,7 @@ const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3]];
 const HEIGHT = 230;
 const MIN_PERIOD_MS = 200;
 const MIN_SELECTION = 4; // pixels: less is a click
+const SHOWN_AXES = 2; // the legend has the values of all curves
 const CLOCK_STEP_S = 5;
 const WINDOWS = ["30s", "2m", "10m", "1h", "8h"];
 
@@ -220,6 +221,7 @@ function legendItem(name, index, panel, scope, legend) {
       decimals = given;
       show();
     },
+    unit,
     text: () => `${value.textContent} ${unit}`,
   };
 }
@@ -232,16 +234,29 @@ function makePlot(frame, names, panel, { range, readings, cursorTime, zoom, foll
     const [from, to] = low === null ? [0, 1] : low === high ? [low - 1, high + 1] : uPlot.rangeNum(low, high, 0.1, true);
     return [min ?? from, max ?? to];
   };
+  const units = [...new Set(readings.map((each) => each.unit))]; // each has a scale of its own
+  const scaleOf = (unit) => `y${units.indexOf(unit)}`;
+  const unitAxis = (unit, index) => ({
+    ...axis,
+    scale: scaleOf(unit),
+    side: index ? 1 : 3,
+    show: index < SHOWN_AXES,
+    size: 52,
+    grid: index ? { show: false } : axis.grid,
+    values: (_, ticks) => ticks.map((tick) => formatNumber(tick)),
+    ...(units.length > 1 && { label: unit, labelSize: 16, labelFont: axis.font }),
+  });
   const options = {
     width: frame.clientWidth,
     height: HEIGHT,
     padding: [8, 12, 0, 0],
     legend: { show: false },
     cursor: { y: false, drag: { x: true, y: false, setScale: false }, points: { size: 6 }, bind: { dblclick: () => () => follow() } },
-    scales: { x: { range }, y: { range: y } },
-    axes: [{ ...axis, size: 34, space: 70, values: times }, { ...axis, size: 52, values: (_, ticks) => ticks.map((tick) => formatNumber(tick)) }],
+    scales: { x: { range }, ...Object.fromEntries(units.map((unit) => [scaleOf(unit), { range: y }])) },
+    axes: [{ ...axis, size: 34, space: 70, values: times }, ...units.map(unitAxis)],
     series: [{}, ...names.map((name, index) => ({
       label: name,
+      scale: scaleOf(readings[index].unit),
       stroke: () => color(`--curve-${index % COLORS}`),
       dash: DASHES[Math.floor(index / COLORS) % DASHES.length],
       width: 1.5,
@@ -262,11 +277,11 @@ function makePlot(frame, names, panel, { range, readings, cursorTime, zoom, foll
         plot.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
       }],
       setScale: [(plot, key) => {
-        if (key !== "y" || plot.scales.y.min == null) return;
-        const span = plot.scales.y.max - plot.scales.y.min;
+        const { min: low, max: high } = plot.scales[key];
+        if (key === "x" || low == null) return;
         // A digit more than a pixel shows.
-        const decimals = Math.min(6, Math.max(0, 2 - Math.floor(Math.log10(span || 1))));
-        for (const reading of readings) reading.scale(decimals);
+        const decimals = Math.min(6, Math.max(0, 2 - Math.floor(Math.log10(high - low || 1))));
+        for (const reading of readings) if (scaleOf(reading.unit) === key) reading.scale(decimals);
       }],
     },
   };
