@@ -42,7 +42,9 @@ PICTURE_PAGE = """\
             "#lamp": {of: island-02/temperature, warn: 1, alarm: 500}
             "#hand": {of: island-02/temperature, show: turn}
             "#off": {of: island-03/alarm, show: visible}
-        - {kind: trend, of: [island-02/temperature, island-02/pressure, island-03/position], window: 30s}
+        - kind: trend
+          of: [island-02/temperature, island-02/pressure, island-03/position]
+          window: 30s
 """
 PICTURE = """\
 <svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 200 100" width="200" height="100">
