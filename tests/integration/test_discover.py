@@ -26,6 +26,7 @@ from tests.support.appliance import (
     EAPCTL,
     Appliance,
     Plants,
+    SharedAppliance,
     run_eapctl,
     troubles,
     wait_until,
@@ -47,8 +48,13 @@ def line_network() -> Iterator[Namespace]:
 
 
 @pytest.fixture(scope="module")
-def line(module_farm: Plants, line_network: Namespace) -> Appliance:
-    return module_farm.run(SOLAR_LINE, prefix=line_network.prefix)
+def shared(module_farm: Plants, line_network: Namespace) -> SharedAppliance:
+    return SharedAppliance(lambda: module_farm.run(SOLAR_LINE, prefix=line_network.prefix))
+
+
+@pytest.fixture
+def line(shared: SharedAppliance) -> Appliance:
+    return shared.running()
 
 
 def forget_kernel_socket() -> None:
@@ -88,7 +94,8 @@ def record(path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def capture(line: Appliance, line_network: Namespace, module_farm: Plants) -> Path:
+def capture(shared: SharedAppliance, line_network: Namespace, module_farm: Plants) -> Path:
+    shared.running()
     path = module_farm.folder / "line.pcap"
     with inside(line_network):
         record(path)
@@ -150,6 +157,97 @@ def test_dictionary_alone_lists_pds_that_were_not_seen(line: Appliance) -> None:
     unknown = run_eapctl(line.runtime, "discover", "--from", "9.9.9.9.9.9")
     assert unknown.returncode == 1
     assert "no route to 9.9.9.9.9.9" in unknown.stderr
+
+
+PAGE = (ROOT / "docs" / "discover.md").read_text()
+BLOCK = re.compile(r"```console\n(.*?)```", re.DOTALL)
+
+
+def outline(text: str) -> str:
+    """Reduce an output to what is the same in every run."""
+    text = re.sub(r"\d+(\.\d+)? (µs|ms)\b", "TIME", text)
+    text = re.sub(r"\b\d+(\.\d+)? to \d+(\.\d+)?", "RANGE", text)
+    text = re.sub(
+        r'"(rate_hz|jitter_us|jitter_max_us|received|age_ms|missed)":[\d.]+', r'"\1":N', text
+    )
+    text = re.sub(r"[\d.]+ +TIME", "HZ TIME", text)
+    # The guesses depend on the moment; tests/unit/eap/pd/test_appearance.py has their tests.
+    text = re.sub(r" *# looks like .*\n", "", text)
+    text = re.sub(r'"looks_like":.*', '"looks_like":[]}', text)
+    text = re.sub(r"─+", "─", text)
+    return "\n".join(" ".join(row.split()) for row in text.splitlines())
+
+
+def test_examples_of_the_page_print_what_it_shows(line: Appliance, line_network: Namespace) -> None:
+    with (
+        shell(COLUMNS="100", EAP_RUNTIME_DIR=str(line.runtime)) as reader,
+        inside(line_network),
+    ):
+        shown = list(replayed(reader))
+    command, ready, _ = shown[0]
+    assert command == "eapctl run config/solar-line.yaml &"
+    assert json.loads(ready)["stations"] == [each["name"] for each in line.status()["stations"]]
+    assert len(shown) >= 7
+    for command, expected, printed in shown[1:]:
+        assert outline(printed) == outline(expected), command
+
+
+def replayed(reader: Shell) -> Iterator[tuple[str, str, str]]:
+    for block in BLOCK.findall(PAGE):
+        for command, expected in commands(block):
+            # The first starts the line, which runs already.
+            yield command, expected, "" if command.endswith(" &") else reader.run(command)
+
+
+def send_again(network: Namespace, path: Path) -> dict[str, int]:
+    """Send the captured frames to their destinations at their own pace, from another host."""
+    sent: dict[str, int] = {}
+    with network.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        start_s = first_s = None
+        for frame in iter_capture(path):
+            if frame.data[1] >> 4 != FrameType.PROCESS_DATA:
+                continue  # probes of routes
+            at_s = frame.at_ns / 1e9
+            if start_s is None or first_s is None:
+                start_s, first_s = time.monotonic(), at_s
+            time.sleep(max(0.0, start_s + at_s - first_s - time.monotonic()))
+            host, _, port = frame.packet.destination.partition(":")
+            sock.sendto(frame.data, (host, int(port)))
+            sent[host] = sent.get(host, 0) + 1
+    return sent
+
+
+def pd_list(appliance: Appliance) -> list[dict[str, Any]]:
+    rows = map(json.loads, appliance.command("pd", "list", "--json").splitlines())
+    return [row for row in rows if row["direction"] == "rx"]
+
+
+def test_written_plant_receives_all_pds_and_loses_none(
+    capture: Path, farm: Plants, shared: SharedAppliance
+) -> None:
+    """In a network of its own, where it has the addresses of the line's stations."""
+    shared.stop()  # it costs a quarter of a processor
+    target = farm.folder / "found.yaml"
+    rows = discover(farm.folder, "--pcap", capture, "--write", target)
+    # A busy host leaves cycles out: then the capture has gaps already, which are no loss here.
+    gaps = {(row["publisher"], row["pd_id"]): row["missed"] for row in rows}
+    with namespace() as other:
+        appliance = farm.run(target, prefix=other.prefix)
+        sent = sum(send_again(other, capture).values())
+        assert sent > CAPTURED * 0.9
+
+        def received() -> int:
+            return sum(rx["received"] for rx in appliance.status()["stations"][0]["pd"]["rx"])
+
+        wait_until(lambda: received() >= sent)
+        station = appliance.status()["stations"][0]
+        assert len(station["pd"]["rx"]) == 54
+        for rx, row in zip(station["pd"]["rx"], pd_list(appliance), strict=True):
+            assert troubles(rx) == (gaps[row["publisher"], row["id"]], 0, 0)
+        assert received() == sent
+        assert station["discarded"] == {}
+        assert {rx["state"] for rx in station["pd"]["rx"]} == {"running"}
+        appliance.stop()
 
 
 @pytest.fixture(scope="module")
@@ -216,86 +314,3 @@ def test_lenient_port_takes_frames_of_a_tool_with_wrong_length(farm: Plants) -> 
         assert appliance.status()["stations"][0]["discarded"] == {"wrong_length": 3}
         assert appliance.values("panel")["level"] == 0x1234
         appliance.stop()
-
-
-def send_again(network: Namespace, path: Path) -> dict[str, int]:
-    """Send the captured frames to their destinations at their own pace, from another host."""
-    sent: dict[str, int] = {}
-    with network.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        start_s = first_s = None
-        for frame in iter_capture(path):
-            if frame.data[1] >> 4 != FrameType.PROCESS_DATA:
-                continue  # probes of routes
-            at_s = frame.at_ns / 1e9
-            if start_s is None or first_s is None:
-                start_s, first_s = time.monotonic(), at_s
-            time.sleep(max(0.0, start_s + at_s - first_s - time.monotonic()))
-            host, _, port = frame.packet.destination.partition(":")
-            sock.sendto(frame.data, (host, int(port)))
-            sent[host] = sent.get(host, 0) + 1
-    return sent
-
-
-def pd_list(appliance: Appliance) -> list[dict[str, Any]]:
-    rows = map(json.loads, appliance.command("pd", "list", "--json").splitlines())
-    return [row for row in rows if row["direction"] == "rx"]
-
-
-def test_written_plant_receives_all_pds_and_loses_none(capture: Path, farm: Plants) -> None:
-    """In a network of its own, where it has the addresses of the line's stations."""
-    target = farm.folder / "found.yaml"
-    rows = discover(farm.folder, "--pcap", capture, "--write", target)
-    # A busy host leaves cycles out: then the capture has gaps already, which are no loss here.
-    gaps = {(row["publisher"], row["pd_id"]): row["missed"] for row in rows}
-    with namespace() as other:
-        appliance = farm.run(target, prefix=other.prefix)
-        sent = sum(send_again(other, capture).values())
-        assert sent > CAPTURED * 0.9
-
-        def received() -> int:
-            return sum(rx["received"] for rx in appliance.status()["stations"][0]["pd"]["rx"])
-
-        wait_until(lambda: received() >= sent)
-        station = appliance.status()["stations"][0]
-        assert len(station["pd"]["rx"]) == 54
-        for rx, row in zip(station["pd"]["rx"], pd_list(appliance), strict=True):
-            assert troubles(rx) == (gaps[row["publisher"], row["id"]], 0, 0)
-        assert received() == sent
-        assert station["discarded"] == {}
-        assert {rx["state"] for rx in station["pd"]["rx"]} == {"running"}
-        appliance.stop()
-
-
-PAGE = (ROOT / "docs" / "discover.md").read_text()
-BLOCK = re.compile(r"```console\n(.*?)```", re.DOTALL)
-
-
-def outline(text: str) -> str:
-    """Reduce an output to what is the same in every run."""
-    text = re.sub(r"\d+(\.\d+)? (µs|ms)\b", "TIME", text)
-    text = re.sub(r"\b\d+(\.\d+)? to \d+(\.\d+)?", "RANGE", text)
-    text = re.sub(
-        r'"(rate_hz|jitter_us|jitter_max_us|received|age_ms|missed)":[\d.]+', r'"\1":N', text
-    )
-    text = re.sub(r"[\d.]+ +TIME", "HZ TIME", text)
-    # The guesses depend on the moment; tests/unit/eap/pd/test_appearance.py has their tests.
-    text = re.sub(r" *# looks like .*\n", "", text)
-    text = re.sub(r'"looks_like":.*', '"looks_like":[]}', text)
-    text = re.sub(r"─+", "─", text)
-    return "\n".join(" ".join(row.split()) for row in text.splitlines())
-
-
-def test_examples_of_the_page_print_what_it_shows() -> None:
-    with namespace() as network, shell(COLUMNS="100") as reader:
-        (reader.folder / "config").symlink_to(ROOT / "config")
-        with inside(network):
-            shown = list(replayed(reader))
-    assert len(shown) >= 7
-    for command, expected, printed in shown:
-        assert outline(printed) == outline(expected), command
-
-
-def replayed(reader: Shell) -> Iterator[tuple[str, str, str]]:
-    for block in BLOCK.findall(PAGE):
-        for command, expected in commands(block):
-            yield command, expected, reader.run(command)
