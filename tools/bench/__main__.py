@@ -29,9 +29,9 @@ from tools.bench.network import ROOT
 from tools.bench.settings import Settings, quick
 
 NAMES = (
-    "throughput", "latency", "poll", "lateness", "solar", "recording", "web", "mqtt", "limits",
-    "receive", "objects", "change", "routing", "ads", "gateway", "files", "startup", "acyclic",
-    "cycle", "plantbus", "recovery", "segment",
+    "throughput", "latency", "poll", "lateness", "solar", "recording", "web", "mqtt", "opcua",
+    "limits", "receive", "objects", "change", "routing", "ads", "gateway", "files", "startup",
+    "acyclic", "cycle", "plantbus", "recovery", "segment",
 )  # fmt: skip
 PAGE = ROOT / "docs" / "performance.md"
 BEGIN, END = "<!-- bench begin -->", "<!-- bench end -->"
