@@ -129,6 +129,12 @@ def _slave_states(bus: Row) -> dict[str, int]:
     return counts
 
 
+def _bridge_is_up(bridge: Row) -> int:
+    # One that only reads controllers has no peer of its own.
+    own = bridge["is_up"] or not bridge["peer"]
+    return int(own and all(peer["is_up"] for peer in bridge.get("peers", ())))
+
+
 _APPLIANCE = (
     Family(
         "eap_findings",
@@ -159,6 +165,21 @@ _PROCESS = (
         "eap_process_dropped_bus_answers",
         "Answers of the engine that services did not read.",
         *("bus_requests", "dropped"),
+    ),
+)
+_BRIDGE = (
+    Family(
+        "eap_bridge_up",
+        "gauge",
+        "1 while the bridge listens or is connected, to all its controllers, too.",
+        _bridge_is_up,
+    ),
+    _gauge("eap_bridge_clients", "Connections to the bridge, where it is a server.", "clients"),
+    _counter("eap_bridge_sent_values", "Values passed on from the plant.", "sent"),
+    _counter("eap_bridge_received_writes", "Writes that clients requested.", "received"),
+    _counter("eap_bridge_refused_writes", "Those that were not done.", "refused"),
+    _counter(
+        "eap_bridge_dropped", "Values and requests left out for a slow other side.", "dropped"
     ),
 )
 _LISTENER = (
@@ -313,8 +334,8 @@ _OWN = (
     _gauge("eap_metrics_left_out", "Series beyond the limit of one answer.", "left_out"),
 )
 FAMILIES: Final = (
-    *_APPLIANCE, *_PROCESS, *_LISTENER, *_STATION, *_PORT, *_FRAME, *_SENT_PD, *_RECEIVED_PD,
-    *_BUS, *_SLAVE, *_OWN,
+    *_APPLIANCE, *_PROCESS, *_BRIDGE, *_LISTENER, *_STATION, *_PORT, *_FRAME, *_SENT_PD,
+    *_RECEIVED_PD, *_BUS, *_SLAVE, *_OWN,
 )  # fmt: skip
 
 
@@ -427,6 +448,8 @@ def _appliance_rows(
     processes |= {f"segment {name}": process for name, process in segments.items()}
     for name, process in processes.items():
         yield _PROCESS, (*labels, "process", name), process
+        if (bridge := process.get("bridge")) is not None:
+            yield _BRIDGE, (*labels, "bridge", name), bridge
     for listener in appliance.listeners:
         yield _LISTENER, (*labels, "listener", listener["name"]), listener
 

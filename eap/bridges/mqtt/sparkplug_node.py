@@ -78,6 +78,7 @@ class SparkplugNode:
         self._first: list[Outgoing] = []
         self._is_connected = False
         self._is_unborn = False
+        self._knows_variables = False
 
     @property
     def has_waiting(self) -> bool:
@@ -121,12 +122,15 @@ class SparkplugNode:
             station = variables[name].station
             device = self._devices.setdefault(station, _Device(level(station)))
             device.names.append(name)
+        self._knows_variables = True
         self._is_unborn = self._is_connected
 
     def connected(self, samples: Mapping[str, Sample], now_ns: int) -> None:
         """Begin with a new connection: subscriptions, NBIRTH, and DBIRTH of what has values."""
         del now_ns
-        self._is_connected = self._is_unborn = True
+        self._is_connected = True
+        # Without templates a birth would be of no use: it waits until the variables are known.
+        self._is_unborn = self._knows_variables
         self._samples = samples
         self._first = [Subscribe((self._topic("NCMD"), f"{self._topic('DCMD')}/+"))]
 

@@ -90,6 +90,28 @@ def test_the_next_report_has_its_own_numbers(writer: MetricsWriter) -> None:
     assert value(gone, "eap_frame_sent_total", **where) is None
 
 
+def test_bridge_has_its_state_and_counters(writer: MetricsWriter) -> None:
+    status = document()
+    bridge = {"peer": "mqtt://b:1883", "is_up": False, "reason": "refused", "since": 0.0,
+              "clients": None, "sent": 500, "received": 4, "refused": 1, "dropped": 2}  # fmt: skip
+    status["processes"]["mqtt"] = {"pid": 103, "bridge": bridge}
+    found = samples(writer.write(with_findings(status)))
+    counts = ("up", "sent_values_total", "refused_writes_total", "dropped_total", "clients")
+    assert [value(found, f"eap_bridge_{each}", bridge="mqtt") for each in counts] == [
+        0, 500, 1, 2, None,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("is_up", [False, True])
+def test_bridge_to_controllers_is_up_with_all_of_them(writer: MetricsWriter, is_up: bool) -> None:
+    status = document()
+    bridge = {"peer": "", "is_up": False, "peers": [{"is_up": True}, {"is_up": is_up}]}
+    counts = dict.fromkeys(("clients", "sent", "received", "refused", "dropped"), 0)
+    status["processes"]["s7"] = {"pid": 103, "bridge": bridge | counts}
+    found = samples(writer.write(with_findings(status)))
+    assert value(found, "eap_bridge_up", bridge="s7") == is_up
+
+
 def test_silent_appliances_are_counted(writer: MetricsWriter) -> None:
     found = samples(writer.write(report(), 2))
     assert found["eap_unreachable", frozenset()] == 2

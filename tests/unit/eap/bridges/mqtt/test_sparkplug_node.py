@@ -104,6 +104,18 @@ def test_connection_begins_with_births_of_node_and_stations():
     assert found[2][1].metrics[0].value == "Run"
 
 
+def test_node_is_born_when_its_variables_are_known():
+    node = SparkplugNode(
+        MqttSection(broker="mqtt://b"), SparkplugSection(group="works", node="cell"), "x"
+    )
+    node.will()
+    node.connected({}, AT_NS)
+    assert not messages(node)
+    node.set_variables(VARIABLES, AT_NS)
+    node.put_due(SAMPLES, AT_NS)
+    assert kinds(messages(node)) == ["NBIRTH", "DBIRTH/a", "DBIRTH/b"]
+
+
 def test_bd_seq_counts_connections_and_wraps():
     node = make()
     numbers = [decode_payload(node.will().payload).metrics[0].value for _ in range(257)]
