@@ -308,6 +308,28 @@ def test_nodes7_reads_and_writes_the_served_blocks(plant: Appliance) -> None:
     assert {line["error"] for line in lines} == {""}
 
 
+def test_snap7_reads_and_writes_the_served_blocks(plant: Appliance) -> None:
+    from snap7.client import Client
+
+    plant.request("write", station="mill", values={"setpoint": 1.5, "on": False})
+    wait_until(lambda: plant.values("mill")["temp"] == 21.5)
+    client = Client()
+    client.connect("127.9.80.1", 0, 1, 2102)
+    try:
+        assert client.get_pdu_length() == 480
+        block = client.db_read(1, 0, 22)
+        assert struct.unpack_from(">fIf", block)[::2] == (21.5, 1.5)
+        client.db_write(1, 8, bytearray(struct.pack(">f", 6.25)))
+        wait_until(lambda: plant.values("mill")["setpoint"] == 6.25)
+        with pytest.raises(Exception, match=r"denied|not allowed|Access"):
+            client.db_write(1, 0, bytearray(4))
+        with pytest.raises(Exception, match=r"exist|address"):
+            client.db_read(7, 0, 4)
+        assert client.get_connected()
+    finally:
+        client.disconnect()
+
+
 JSMODBUS = """
 const Modbus = require('jsmodbus'), net = require('net');
 const socket = new net.Socket(), client = new Modbus.client.TCP(socket, 3, 5000);

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from eap.config.field_sections import FieldServer, ModbusBridge, S7Bridge
@@ -183,3 +184,21 @@ def test_wrong_servers_are_findings(tmp_path: Path, before: str, after: str, par
     assert before in keys
     found = findings(tmp_path, keys=keys.replace(before, after))
     assert any(part in each for each in found), found
+
+
+def test_server_runs_on_the_host_that_has_its_address(tmp_path: Path) -> None:
+    keys = SERVER.replace(
+        "  server:\n    blocks", "  server:\n    listen: 10.0.9.1:102\n    blocks"
+    )
+    keys = keys.replace('"mill/*o*n*"', "mill/on")
+    keys += "hosts:\n  - {name: ipc1, address: 10.0.9.1, stations: [mill]}\n"
+    whole = result(tmp_path, keys=keys).plant
+    assert whole is not None
+    here = whole.on_host(whole.hosts[0]).bridges["s7"]
+    other = whole.on_host(msgspec.structs.replace(whole.hosts[0], address="10.0.9.2"))
+    assert isinstance(here, S7Bridge)
+    assert here.server is not None
+    assert other.bridges["s7"] == msgspec.structs.replace(here, server=None)
+    modbus = other.bridges["modbus"]
+    assert isinstance(modbus, ModbusBridge)
+    assert modbus.server is not None  # a loopback address, which each host has
