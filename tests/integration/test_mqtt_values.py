@@ -14,7 +14,7 @@ import pytest
 
 from tests.support.appliance import Appliance, Plants, plants
 from tests.support.eventually import wait_until
-from tests.support.mosquitto import Broker, broker
+from tests.support.mosquitto import Broker, broker, write_certificates, write_passwords
 from tests.support.mqttlisten import (
     Heard,
     Listener,
@@ -328,6 +328,46 @@ def test_sparkplug_death_has_the_number_of_the_birth(cell: Cell):
     wait_until(lambda: [m for m in sparkplug(cell, since) if "/NBIRTH/" in m.topic][1:])
     host = host_of(sparkplug(cell, since))
     assert (host.births, host.deaths) == (2, 1)
+
+
+SECURE = """\
+plant: safe
+stations:
+  - name: mixer
+    net_id: 127.9.73.3.1.1
+    ports: [{{name: eap0, kind: eap, interface: "udp://127.9.73.3", net_id: 127.9.73.3.2.1}}]
+    variables: {{setpoint: {{type: INT, default: 7}}}}
+    routes:
+      - {{mqtt: "mqtts://{address}:8883", network: works, user: mixer,
+         password_file: {folder}/secret, tls: {{ca: {folder}/ca.pem}}}}
+mqtt: works
+"""
+
+
+def test_broker_of_a_route_is_used_with_its_tls_and_login(folder: Plants, tmp_path: Path):
+    address = "127.9.73.8"
+    files = write_certificates(tmp_path, address)
+    passwords = write_passwords(tmp_path, mixer="correct", panel="horse")
+    (tmp_path / "secret").write_text("wrong\n")
+    login = ("-p", "8883", "--cafile", str(files["ca"]), "-u", "panel", "-P", "horse")
+    settings = (f"cafile {files['ca']}", f"certfile {files['broker']}",
+                f"keyfile {files['broker_key']}", "allow_anonymous false",
+                f"password_file {passwords}")  # fmt: skip
+    with (
+        broker(tmp_path / "broker", address, *settings, port=8883),
+        listen(address, "safe/#", *login) as heard,
+    ):
+        text = SECURE.format(address=address, folder=tmp_path)
+        plant = folder.run(folder.write(text, "safe.yaml"))
+
+        def reason() -> str:
+            return plant.status()["processes"]["mqtt"].get("bridge", {}).get("reason", "")
+
+        wait_until(lambda: "user 'mixer' or the password is rejected" in reason())
+        (tmp_path / "secret").write_text("correct\n")  # read anew for each connection
+        wait_until(lambda: heard.payloads("safe/mixer/setpoint"), 40)
+        assert heard.payloads("safe/mixer/setpoint")[0]["value"] == 7
+        plant.stop()
 
 
 def test_plant_ends_with_the_status_offline(cell: Cell):

@@ -10,7 +10,9 @@ import pytest
 
 from eap.config.mqtt_sections import MqttBridgeSpec
 from eap.runtime.plantfile import load_plant
+from tests.support.eventually import wait_until
 from tests.support.mosquitto import broker
+from tests.support.mqttlisten import listen, publish
 from tests.support.pages import commands, shell
 
 pytestmark = [pytest.mark.net, pytest.mark.mosquitto]
@@ -20,6 +22,7 @@ PAGE = (ROOT / "docs" / "mqtt-values.md").read_text()
 PLANT = re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 CONSOLE = "\n".join(re.findall(r"```console\n(.*?)```", PAGE, re.DOTALL))
 REFERENCE = (ROOT / "docs" / "plant-file.md").read_text().partition("## Values by MQTT")[2]
+SECTION = REFERENCE.partition("\n## ")[0]
 ADDRESS = "127.9.74.9"
 
 
@@ -45,13 +48,42 @@ def test_mqtt_values_page_examples_run(tmp_path):
         assert done == 6
 
 
+def test_mqtt_values_page_bridge_joins_two_brokers(tmp_path):
+    """Values and births go out, commands come in; only address and login are replaced."""
+    (block,) = re.findall(r"```text\n(connection .*?)```", PAGE, re.DOTALL)
+    private = ("bridge_cafile", "remote_username", "remote_password")
+    lines = [line for line in block.splitlines() if not line.startswith(private)]
+    outer = "127.9.74.10"
+    lines[1] = f"address {outer}:1883"
+    values = {"cell/mixer/turns": b"1", "spBv1.0/works/NBIRTH/cell": b"2",
+              "spBv1.0/works/DDATA/cell/mixer": b"3"}  # fmt: skip
+    commands_in = {"cell/mixer/setpoint/set": b"4", "spBv1.0/works/NCMD/cell": b"5",
+                   "spBv1.0/works/DCMD/cell/mixer": b"6"}  # fmt: skip
+    with (
+        broker(tmp_path / "outer", outer),
+        listen(outer) as outside,
+        broker(tmp_path / "inner", ADDRESS, "allow_anonymous true", *lines),
+        listen(ADDRESS) as inside,
+    ):
+        wait_until(lambda: outside.texts("cell/bridge") == ["1"])
+        for heard, address, sent in ((outside, ADDRESS, values), (inside, outer, commands_in)):
+            for topic, payload in sent.items():
+                publish(address, topic, payload)
+            for topic, payload in sent.items():
+                wait_until(lambda h=heard, t=topic, p=payload: h.texts(t) == [p.decode()])
+        publish(outer, "cell/mixer/turns", b"7")
+        publish(outer, "cell/mixer/setpoint/set", b"8")
+        wait_until(lambda: inside.texts("cell/mixer/setpoint/set") == ["4", "8"])
+        assert inside.texts("cell/mixer/turns") == ["1"]  # values do not come in
+
+
 def test_mqtt_values_results_of_the_page_are_json():
     (results,) = re.findall(r"```json\n(.*?)```", PAGE, re.DOTALL)
     assert [json.loads(line)["ok"] for line in results.splitlines()] == [True, False]
 
 
 def test_plant_file_page_example_of_mqtt_is_valid(tmp_path):
-    (example,) = re.findall(r"```yaml\n(.*?)```", REFERENCE, re.DOTALL)
+    (example,) = re.findall(r"```yaml\n(.*?)```", SECTION, re.DOTALL)
     for name in ("secrets/mqtt", "certificates/works.pem"):
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text("x\n")
