@@ -118,6 +118,14 @@ class Guard:
             answer = refusal(exc.status, exc.reason)
             if "Allow" in exc.headers:
                 answer.headers["Allow"] = exc.headers["Allow"]
+        except ConnectionError:
+            raise  # the client has gone
+        except Exception:
+            # A defect; without this aiohttp answers with a text, and without the headers below.
+            logger.exception("%s %r failed", request.method, request.path[:100])
+            if "Upgrade" in request.headers:
+                raise  # no answer can be sent on a WebSocket
+            answer = refusal(500, "the page's server failed: see its log")
         if not answer.prepared:
             for name, value in HEADERS.items():
                 answer.headers.setdefault(name, value)

@@ -9,6 +9,9 @@ from eap.config.users import Role
 from eap.config.web_sections import CommentRule, SetPanel, WebPage
 from eap.live.logins import Principal
 
+_MAX_SHOWN = 60
+"""Characters of a value in a message."""
+
 
 class SetRules:
     """The ``set`` panels of all pages, by variable.
@@ -44,12 +47,18 @@ def _reason(panel: SetPanel, value: Any, comment: str) -> str:
     has_limits = panel.low is not None or panel.high is not None
     if has_limits:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            return f"{value!r} is not a number"
+            return f"{_shown(value)} is not a number"
         if panel.low is not None and value < panel.low:
-            return f"{value:g} is below the smallest value, {panel.low:g}"
+            return f"{_shown(value)} is below the smallest value, {panel.low:g}"
         # NaN is above and below nothing.
         if panel.high is not None and not value <= panel.high:
-            return f"{value:g} is above the largest value, {panel.high:g}"
+            return f"{_shown(value)} is above the largest value, {panel.high:g}"
     if panel.comment is CommentRule.REQUIRED and not comment.strip():
         return "a comment is required"
     return ""
+
+
+def _shown(value: Any) -> str:
+    """Return a value, which may be as long as a request, as text for a message."""
+    text = f"{value:g}" if isinstance(value, float) else repr(value)
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}…"

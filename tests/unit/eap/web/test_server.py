@@ -199,13 +199,38 @@ def test_value_that_a_browser_sets_is_an_event():
     play(script, CLOSED)
 
 
-def test_write_of_nan_is_refused():
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("NaN", "mixer/setpoint: nan is not a value"),
+        ("1e999", "mixer/setpoint: inf is not a value"),
+        ("null", "mixer/setpoint: None is not a value"),
+        ("9" * 400, f"mixer/setpoint: {'9' * 60}… is above the largest value, 90"),
+        (f'"{"x" * 400}"', f"mixer/setpoint: '{'x' * 59}… is not a number"),
+    ],
+)
+def test_write_of_what_is_no_value_is_refused(value, message):
     async def script(found: Site) -> None:
         client = await found.client()
-        headers = {"Content-Type": "application/json"}
-        async with client.post(SETPOINT, data='{"value": NaN}', headers=headers) as answer:
-            assert answer.status == 422
+        body, headers = f'{{"value": {value}}}', {"Content-Type": "application/json"}
+        async with client.post(SETPOINT, data=body, headers=headers) as answer:
+            assert (answer.status, await reason(answer)) == (422, message)
         assert not found.plant.written
+
+    play(script)
+
+
+def test_defect_of_a_handler_is_answered_without_its_text(monkeypatch, caplog):
+    async def script(found: Site) -> None:
+        monkeypatch.setattr(found.server.feed, "events", None)
+        client = await found.client()
+        async with client.get("/api/v1/events") as answer:
+            assert (answer.status, await reason(answer)) == (
+                500,
+                "the page's server failed: see its log",
+            )
+            assert "Content-Security-Policy" in answer.headers
+        assert "GET '/api/v1/events' failed" in caplog.text
 
     play(script)
 
