@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
-from math import isfinite
 from pathlib import Path
 from time import time
 from typing import Any, Final
@@ -290,9 +289,8 @@ class Api:
         body = await read_json(request)
         if not isinstance(body, dict) or "value" not in body or set(body) - {"value", "comment"}:
             raise web.HTTPBadRequest(reason='expected {"value": …}, with "comment": "…" or without')
-        value = body["value"]
-        if value is None or (isinstance(value, float) and not isfinite(value)):
-            return refusal(422, f"{name}: {value} is not a value")
+        if body["value"] is None:
+            return refusal(422, f"{name}: null is not a value")
         comment = body.get("comment", "")
         if not isinstance(comment, str) or len(comment) > _MAX_COMMENT:
             message = f"comment: expected a text of up to {_MAX_COMMENT} characters"

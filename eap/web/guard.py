@@ -23,6 +23,7 @@ from secrets import token_hex
 from time import monotonic, time
 from typing import Final, TypeAlias
 
+import msgspec
 from aiohttp import web
 
 from eap.config.web import default_role
@@ -73,8 +74,10 @@ logger = logging.getLogger(__name__)
 def refusal(status: int, message: str, **headers: str) -> web.Response:
     """Return the answer to a request that is refused, ``{"error": {"message"}}``."""
     body = json.dumps({"error": {"message": message}}, ensure_ascii=False)
+    # Bytes of a header that are no UTF-8 are surrogates in its text.
+    encoded = body.encode("utf-8", "backslashreplace")
     return web.Response(
-        status=status, text=body, content_type="application/json", headers=headers or None
+        status=status, body=encoded, content_type="application/json", headers=headers or None
     )
 
 
@@ -309,6 +312,7 @@ async def read_json(request: web.Request) -> object:
     except TimeoutError:
         raise web.HTTPRequestTimeout(reason="the body did not come in time") from None
     try:
-        return json.loads(body)
-    except (ValueError, RecursionError):
+        # json.loads() takes NaN, and half of a surrogate pair, which no text can have.
+        return msgspec.json.decode(body)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
         raise web.HTTPBadRequest(reason="the body is not JSON") from None
