@@ -20,7 +20,7 @@ for pair in $wanted; do
     PATH=$PATH:/usr/sbin:/sbin command -v "${pair%%=*}" >/dev/null || packages="$packages ${pair#*=}"
 done
 # Without npm packages, for which some machines have no registry, only few tests are skipped.
-[ "$1" = bench ] || sh "$here/npm_peers.sh" || :
+[ "$1" != test ] || sh "$here/npm_peers.sh" || :
 [ -n "$packages" ] || exit 0
 # shellcheck disable=SC2086  # a list of package names
 exec sh "$here/apt.sh" "make $1" $packages

@@ -129,6 +129,18 @@ def test_service_is_started_again_when_its_first_process_dies(debian):
     )
 
 
+def test_log_is_in_the_journal_with_fields(debian):
+    command = "journalctl --unit eap@demo --output json EAP_PROCESS=supervisor"
+    debian.run(f"kill -9 {status(debian)['processes']['engine']['pid']}")
+    debian.wait_for(command, lambda text: "engine runs again" in text)
+    entries = [json.loads(line) for line in debian.run(command).splitlines()]
+    (entry,) = (each for each in entries if "engine ended" in each["MESSAGE"])
+    assert entry["MESSAGE"].startswith("supervisor: engine ended (killed by SIGKILL)")
+    assert (entry["PRIORITY"], entry["EAP_PLANT"]) == ("4", "demo")
+    assert (entry["EAP_AREA"], entry["SYSLOG_IDENTIFIER"]) == ("supervisor", "eapctl")
+    assert entry["_SYSTEMD_UNIT"] == "eap@demo.service"
+
+
 def test_upgrade_keeps_state_and_goes_on(debian, package, tmp_path):
     debian.run("eapctl state island-02 PREOP && echo '# mine' >> /etc/eap/demo.yaml")
     first = shown(debian, "MainPID")
