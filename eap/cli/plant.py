@@ -244,7 +244,7 @@ _EMPTY = '""'
 
 
 def plant_arguments(command: CommandT) -> CommandT:
-    """Add PLANT and ``--station``."""
+    """Add PLANT, ``--station`` and ``--local``."""
     stations = click.option(
         "--station",
         "stations",
@@ -252,7 +252,12 @@ def plant_arguments(command: CommandT) -> CommandT:
         metavar="NAME",
         help="Only this station; repeatable.",
     )
-    return click.argument("plant", type=PLANT_FILE)(stations(command))
+    local = click.option(
+        "--local",
+        is_flag=True,
+        help="Only stations that run on this computer, of a plant with several hosts.",
+    )
+    return click.argument("plant", type=PLANT_FILE)(stations(local(command)))
 
 
 keep_going_option = click.option(
@@ -263,7 +268,7 @@ _RESULT = json_option("Print one object: ok, the steps with their results, refus
 
 @contextmanager
 def running_plant(
-    file: Path, wanted: tuple[str, ...]
+    file: Path, wanted: tuple[str, ...], *, local: bool
 ) -> Iterator[tuple[PlantLink, dict[str, StationSpec]]]:
     """Connect to the running part of the plant in *file*, for the length of a block.
 
@@ -274,7 +279,7 @@ def running_plant(
     from eap.live.plant_hosts import link_to_hosts
     from eap.ops.plant import choose, load_or_raise
 
-    with link_to_hosts(load_or_raise(file), file) as (link, plant, notes):
+    with link_to_hosts(load_or_raise(file), file, local=local) as (link, plant, notes):
         for note in notes:
             click.echo(note, err=True)
         yield link, choose(plant, link, wanted)
@@ -284,7 +289,9 @@ def running_plant(
 @plant_arguments
 @json_option("Print one object: ok, stations with changes, the steps of 'apply', absent stations.")
 @click.pass_context
-def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Renderer) -> None:
+def plan(
+    ctx: click.Context, plant: Path, stations: tuple[str, ...], local: bool, output: Renderer
+) -> None:
     """Show the differences, object by object, between PLANT and its stations that run here.
 
     Changes nothing.  Exits with 1 when a station cannot be changed as the file requires while it
@@ -292,12 +299,12 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Ren
     """
     from eap.ops.plant import PlanReport, plan_all, start_command, steps_to
 
-    with running_plant(plant, stations) as (link, wanted):
+    with running_plant(plant, stations, local=local) as (link, wanted):
         plans = plan_all(link, wanted)
         is_possible = not any(each.refused for each in plans)
         order = steps_to(link, wanted) if is_possible else []
         away = () if stations else link.away
-        report = PlanReport.of(plans, order, () if stations else link.absent, away)
+        report = PlanReport.of(plans, order, () if stations or local else link.absent, away)
         hosts = link.hosts
     command = start_command(plant, report.absent)
     output.show(report, lambda each: plan_lines(each, command, hosts))
@@ -311,7 +318,12 @@ def plan(ctx: click.Context, plant: Path, stations: tuple[str, ...], output: Ren
 @_RESULT
 @click.pass_context
 def apply(
-    ctx: click.Context, plant: Path, stations: tuple[str, ...], keep_going: bool, output: Renderer
+    ctx: click.Context,
+    plant: Path,
+    stations: tuple[str, ...],
+    local: bool,
+    keep_going: bool,
+    output: Renderer,
 ) -> None:
     """Apply PLANT to its stations that run here, without a restart.
 
@@ -324,7 +336,7 @@ def apply(
     """
     from eap.ops.plant import apply_steps, cause_of_change, plan_all, steps_to
 
-    with running_plant(plant, stations) as (link, wanted):
+    with running_plant(plant, stations, local=local) as (link, wanted):
         away = () if stations else link.away
         refusing = {each.station: each.refused for each in plan_all(link, wanted) if each.refused}
         # Without --keep-going one refusal stops all: no station changes before all have agreed.
@@ -344,7 +356,12 @@ def apply(
 @_RESULT
 @click.pass_context
 def rollback(
-    ctx: click.Context, plant: Path, stations: tuple[str, ...], keep_going: bool, output: Renderer
+    ctx: click.Context,
+    plant: Path,
+    stations: tuple[str, ...],
+    local: bool,
+    keep_going: bool,
+    output: Renderer,
 ) -> None:
     """Undo the last change of the stations of PLANT that run here.
 
@@ -354,7 +371,7 @@ def rollback(
     """
     from eap.ops.plant import roll_back
 
-    with running_plant(plant, stations) as (link, wanted):
+    with running_plant(plant, stations, local=local) as (link, wanted):
         steps = roll_back(link, tuple(wanted), keep_going=keep_going)
         _run_steps(ctx, steps, link, output, away=() if stations else link.away)
 

@@ -108,14 +108,16 @@ class RemoteAppliance(Closeable):
 
 
 @contextmanager
-def link_to_hosts(plant: Plant, file: Path) -> Iterator[HostLink]:
+def link_to_hosts(plant: Plant, file: Path, *, local: bool = False) -> Iterator[HostLink]:
     """Connect to the appliances that run *plant*, described by *file*, for the length of a block.
 
+    Those of other hosts are left out for a *local* link.
+
     Raises:
-        ControlError: the plant has one host, and none of its stations runs here.
+        ControlError: no other host is wanted, and none of the stations runs here.
         ConfigError: the file cannot be read as another host has it.
     """
-    if not plant.hosts:
+    if local or not plant.hosts:
         with link_to(plant, file) as link:
             yield HostLink(link, plant)
         return

@@ -20,6 +20,7 @@ class ApplianceStatus(msgspec.Struct, frozen=True):
     findings: list[dict[str, Any]] = []
     audit: dict[str, Any] | None = None
     listeners: list[dict[str, Any]] = []
+    release: str = ""
     host: str = ""
     hosts: list[dict[str, Any]] = []
 

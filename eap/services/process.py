@@ -433,6 +433,7 @@ class Services:
             )
             return document | {
                 "audit": audit.report(),
+                "release": RELEASE,
                 **({"host": hosts.own, "hosts": hosts.report()} if hosts.own else {}),
                 "findings": [
                     *hosts.findings(),
