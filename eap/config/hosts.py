@@ -58,6 +58,7 @@ def check_hosts(index: Index, report: FindingReport) -> None:
         _check_frames(index, station, report)
         _check_senders(index, station, report)
     _check_servers(index, report)
+    _check_bridge_names(index, report)
 
 
 def _check_placing(index: Index, report: FindingReport) -> None:
@@ -263,6 +264,20 @@ def _check_servers(index: Index, report: FindingReport) -> None:
         if not any(has_address(host, address) for host in index.plant.hosts):
             message = f"{section.KEY} listens at {listen.host}, which no host has"
             report.add(f"{section.at}.listen", message, "an address of a host, or 127.0.0.1")
+
+
+def _check_bridge_names(index: Index, report: FindingReport) -> None:
+    """Report names by which the bridges of all hosts would be one client of a broker."""
+    mqtt = index.plant.mqtt
+    if mqtt is None or len(index.plant.hosts) == 1:
+        return
+    names = {"client_id": mqtt.client_id}
+    if mqtt.sparkplug is not None:
+        names["sparkplug.node"] = mqtt.sparkplug.node
+    for key, name in names.items():
+        if name:
+            message = f"{key} {name!r} would be that of each host"
+            report.add(f"{mqtt.at}.{key}", message, "none: each host then has one of its own")
 
 
 def is_served_on(host: HostSection, listen: str) -> bool:

@@ -149,6 +149,10 @@ def test_part_of_a_host_has_its_stations_and_servers(loaded):
             "5: web listens at 10.9.9.9, which no",
         ),
         (
+            [("stations:\n", "mqtt: {broker: mqtt://b, client_id: x}\nstations:\n")],
+            "5: client_id 'x' would be that of each host; none: each host then has one of its own",
+        ),
+        (
             [("10.0.0.2.1.1", "10.0.0.1.1.1")],
             "16: NetID 10.0.0.1.1.1 is used twice (first in line 7); a NetID of its own",
         ),
