@@ -56,6 +56,7 @@ deb: dist  ## build the Debian package in dist/, for the Python of this Debian
 
 test-package: deb  ## test wheel and Debian package (as root: in a clean Debian, made by debootstrap)
 	@sh tools/install_peers.sh package || echo 'make test-package: going on; what needs them is skipped and listed'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --group deploy || echo 'make test-package: going on without Ansible'
 	@$(BIN)/python -m pytest tests/package $(ARGS)
 
 properties: setup  ## run the property tests with all their examples; make test takes a quarter

@@ -32,6 +32,7 @@ TOP_LEVEL = frozenset(
         "README.md",
         "config",
         "devicebus",
+        "deploy",
         "docs",
         "eap",
         "pyproject.toml",

@@ -17,7 +17,7 @@ import pytest
 
 from eap.closeable import Closeable
 
-_PACKAGES = "adduser,logrotate,python3,systemd"
+_PACKAGES = "adduser,iproute2,logrotate,openssh-server,python3,systemd"
 # A control group of its own: the systemd of this machine, and others in tests, have theirs.
 _BEGIN = """
 set -e
@@ -120,13 +120,19 @@ class DebianRoot(Closeable):
                 pytest.skip(f"systemd does not start in a namespace here: {reason[-300:]}")
             time.sleep(0.2)
 
+    @property
+    def pid(self) -> int:
+        """Process of systemd, as this machine numbers it; 0 if there is none yet."""
+        children = Path(f"/proc/{self._holder.pid}/task/{self._holder.pid}/children")
+        found = children.read_text().split() if children.exists() else []
+        return int(found[0]) if found else 0
+
     def attempt(self, command: str) -> subprocess.CompletedProcess[str]:
         """Run a shell command as root, in an environment as after a login."""
-        children = Path(f"/proc/{self._holder.pid}/task/{self._holder.pid}/children")
-        inner = children.read_text().split() if children.exists() else []
-        if not inner:
+        pid = self.pid
+        if not pid:
             return subprocess.CompletedProcess(command, 1, "", "no process yet")
-        enter = ["nsenter", "--target", inner[0], "--mount", "--net", "--pid", "--ipc", "--uts"]
+        enter = ["nsenter", "--target", str(pid), "--mount", "--net", "--pid", "--ipc", "--uts"]
         path = "PATH=/usr/sbin:/usr/bin:/sbin:/bin"
         return subprocess.run(
             [*enter, "--root", "--wd", "env", "-i", path, "sh", "-c", command],

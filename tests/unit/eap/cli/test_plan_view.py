@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from eap.cli.plant import change_text, plan_lines
+from eap.cli.change import change_text, plan_lines
 from eap.control.device import ObjectChange
 from eap.device.rollout import Step
 from eap.ops.plant import PlanReport, StationPlan

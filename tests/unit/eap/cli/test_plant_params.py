@@ -9,7 +9,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from eap.cli.plant import keep_going_option, plant_arguments, running_plant
+from eap.cli.change import keep_going_option, plant_arguments, running_plant
 from eap.config.new_plant import Shape, plant_text
 from eap.errors import ConfigError, ControlError
 from eap.ops.plant import load_or_raise
