@@ -19,27 +19,30 @@ from tests.support.plantstub import PlantStub
 @click.command()
 @plant_arguments
 @keep_going_option
-def show(plant, stations, keep_going):
-    click.echo(f"{plant} {stations} {keep_going}")
+def show(plant, stations, local, keep_going):
+    click.echo(f"{plant} {stations} {local} {keep_going}")
 
 
 def test_command_line():
-    words = ["a.yaml", "--station", "x", "--station", "y", "--keep-going"]
-    assert CliRunner().invoke(show, words).output == "a.yaml ('x', 'y') True\n"
-    assert CliRunner().invoke(show, ["a.yaml"]).output == "a.yaml () False\n"
+    words = ["a.yaml", "--station", "x", "--station", "y", "--keep-going", "--local"]
+    assert CliRunner().invoke(show, words).output == "a.yaml ('x', 'y') True True\n"
+    assert CliRunner().invoke(show, ["a.yaml"]).output == "a.yaml () False False\n"
 
 
 def test_connection(tmp_path, runtime):
     file = tmp_path / "ring.yaml"
-    with pytest.raises(ConfigError), running_plant(file, ()):
+    with pytest.raises(ConfigError), running_plant(file, (), local=False):
         pass
     file.write_text(plant_text("ring", 2, Shape.RING))
-    with pytest.raises(ControlError, match="no station of plant ring"), running_plant(file, ()):
+    with (
+        pytest.raises(ControlError, match="no station of plant ring"),
+        running_plant(file, (), local=False),
+    ):
         pass
     plant = load_or_raise(file)
     with ExitStack() as stack:
         PlantStub("ring", plant.stations, stack)
-        with running_plant(file, ("station-02",)) as (link, wanted):
+        with running_plant(file, ("station-02",), local=False) as (link, wanted):
             assert link.stations == ("station-01", "station-02")
             assert wanted == {"station-02": plant.stations[1]}
 
