@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import socket
 from collections.abc import Callable, Mapping
 from time import time_ns
@@ -26,6 +27,8 @@ _ROOM = 256
 """Messages that wait for the broker; what else waits is replaced by newer values."""
 _MAX_COMMANDS = 64
 _WARNED_EVERY_S = 60.0
+
+_ERRNO = re.compile(r"\[Errno \d+\] ")
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +92,7 @@ class ConnectionStates:
         self._reasons[kind] = "not connected yet"
 
         def report(reason: str) -> None:
-            self._reasons[kind] = reason
+            self._reasons[kind] = _ERRNO.sub("", reason)
             self._update()
 
         return report

@@ -171,6 +171,8 @@ class SparkplugNode:
 
     def messages(self, most: int, now_ns: int) -> tuple[list[Outgoing], int]:
         """Return up to *most* messages to send, and the number of values in them."""
+        if not self._is_connected:
+            return [], 0
         found, self._first = self._first, []
         sent = 0
         if self._is_unborn:

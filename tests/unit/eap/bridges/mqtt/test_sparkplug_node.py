@@ -193,7 +193,9 @@ def test_nothing_is_kept_during_an_outage():
     node, _ = born()
     node.disconnected()
     assert node.put({"a/speed": sample(8)}) == 0
+    node.put_due(SAMPLES, AT_NS)
     assert not node.has_waiting
+    assert node.messages(100, AT_NS) == ([], 0)
     node.will()
     node.connected(SAMPLES, AT_NS)
     found = messages(node)
