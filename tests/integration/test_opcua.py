@@ -20,7 +20,7 @@ import pytest
 
 from eap.config.passwords import PasswordHash
 from tests.support.appliance import Appliance, Plants, plants, run_eapctl, wait_until
-from tests.support.npm import needs_npm, node_environment
+from tests.support.npm import NODE_MODULES, needs_npm, node_environment
 
 pytestmark = [
     pytest.mark.net,
@@ -349,6 +349,53 @@ def test_node_opcua_uses_a_signed_and_encrypted_channel_with_a_user(press, tmp_p
             peer.kill()
     assert press.values("press")["setpoint"] == 66
     assert press.values("press")["axis"]["position"] == 9.25
+
+
+@needs_npm("node-red", "node-red-contrib-opcua")
+def test_node_red_runs_the_flow_of_the_page(press, tmp_path):
+    (flow,) = re.findall(r"```json\n(.*?)```", PAGE, re.DOTALL)
+    (tmp_path / "flow.json").write_text(flow)
+    (tmp_path / "flow_cred.json").write_text(
+        json.dumps({"press-2": {"user": "anna", "password": "secret"}})
+    )
+    nodes = "node-red-contrib-opcua"  # alone: to load all that are installed takes long
+    (tmp_path / "node_modules").mkdir()
+    (tmp_path / "node_modules" / nodes).symlink_to(NODE_MODULES / nodes)
+    settings = {
+        "uiPort": 0,
+        "uiHost": "127.0.0.1",
+        "flowFile": "flow.json",
+        "httpAdminRoot": False,
+        "httpNodeRoot": False,
+        "telemetry": {"enabled": False},
+        "credentialSecret": False,
+        "externalModules": {"palette": {"denyList": ["node-red-contrib-ads-client"]}},
+    }
+    (tmp_path / "settings.js").write_text(f"module.exports = {json.dumps(settings)};")
+    values, log = tmp_path / "values.txt", tmp_path / "log"
+    with log.open("w") as out:
+        red = subprocess.Popen(
+            ["node", str(NODE_MODULES / "node-red" / "red.js"), "-u", str(tmp_path)],
+            cwd=tmp_path,
+            env=node_environment() | {"HOME": str(tmp_path)},
+            stdout=out,
+            stderr=out,
+        )
+    with red:
+        try:
+            wait_until(lambda: len(speeds(values)) > 3, 100)
+            wait_until(lambda: press.values("press")["setpoint"] == 33)
+        except AssertionError:
+            pytest.fail(log.read_text())
+        finally:
+            red.kill()
+
+
+def speeds(file: Path) -> list[float]:
+    """Return the values of ``speed`` in a file of Node-RED, which has answers to writes, too."""
+    words = file.read_text().split() if file.exists() else []
+    numbers = [float(each) for each in words if re.fullmatch(r"[0-9.]+", each)]
+    return [each for each in numbers if 45 <= each <= 55]
 
 
 def spoken(peer: subprocess.Popen[str]) -> Iterator[Any]:
