@@ -122,7 +122,13 @@ def export(
 
 def _export_text(result: ExportResult) -> str:
     if result.columns:
-        return f"{result.file}: {count(result.rows, 'row')} of {count(result.columns, 'column')}"
+        rows = f"{result.file}: {count(result.rows, 'row')} of {count(result.columns, 'column')}"
+        missing = result.damaged_chunks
+        return (
+            f"{rows}; {count(missing, 'chunk')} damaged: their values are missing"
+            if missing
+            else rows
+        )
     return f"{result.file}: {count(result.rows, 'frame')}"
 
 

@@ -42,6 +42,8 @@ class ExportResult(Struct, frozen=True):
     form: str
     rows: int
     columns: int
+    damaged_chunks: int
+    """Parts of a recording of values that could not be read, and are missing."""
 
 
 def export_recording(request: ExportRequest, stdout: Callable[[str], object]) -> ExportResult:
@@ -60,7 +62,7 @@ def export_recording(request: ExportRequest, stdout: Callable[[str], object]) ->
     target = _target(request)
     if str(target) == STDOUT:
         count = write_csv(recording, window, select(recording.sources, request.variables), stdout)
-        return ExportResult(STDOUT, request.form, *count)
+        return ExportResult(STDOUT, request.form, *count, recording.damaged_chunks)
     if target.exists():
         if not request.is_forced:
             raise ConfigError(f"{target} exists: overwrite it with --force")
@@ -74,7 +76,7 @@ def export_recording(request: ExportRequest, stdout: Callable[[str], object]) ->
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
-    return ExportResult(str(target), request.form, *count)
+    return ExportResult(str(target), request.form, *count, recording.damaged_chunks)
 
 
 def published_in(plant: Path | None) -> tuple[RecordedFrame, ...]:

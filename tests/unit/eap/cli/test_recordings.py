@@ -83,6 +83,7 @@ def test_export_prints_rows_and_columns(tmp_path: Path) -> None:
     result = run("export", path, "--csv", "--json", "island-01/count")
     assert json.loads(result.stdout) == {
         "file": str(tmp_path / "a.csv"), "form": "csv", "rows": 300, "columns": 1,
+            "damaged_chunks": 0,
     }  # fmt: skip
     lines = run("export", path, "--csv", "-o", "-", "island-01/b", "--until", "+10ms").stdout
     assert lines.splitlines()[0] == "time_ns,island-01/b"

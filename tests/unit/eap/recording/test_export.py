@@ -14,6 +14,7 @@ from eap.errors import ConfigError
 from eap.ops.recordings import ExportRequest, ExportResult, export_recording
 from eap.recording.export import write_csv
 from eap.recording.frames_reader import FramesFile
+from eap.recording.mcap_file import McapFile
 from eap.recording.messages import RecordedVariable
 from eap.recording.parquet import write_parquet
 from eap.recording.published import RecordedPd
@@ -199,3 +200,16 @@ def test_variable_in_several_pds_has_one_cell(frames: Path, tmp_path: Path) -> N
     write_csv(recording, ALL, selection, lines.append)
     assert len(lines) == 301
     assert lines[20].endswith(",3\n")
+
+
+def test_export_of_a_damaged_recording_has_the_number_of_its_damaged_chunks(
+    values: Path, tmp_path: Path
+) -> None:
+    octets = bytearray(values.read_bytes())
+    octets[McapFile(values).chunks[-1].data_offset + 9] ^= 0xFF
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(octets)
+    result = export(damaged, "csv", tmp_path / "a.csv")
+    assert result.rows < 300
+    assert result.damaged_chunks == 1
+    assert export(values, "csv", tmp_path / "b.csv").damaged_chunks == 0

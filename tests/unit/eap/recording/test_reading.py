@@ -269,3 +269,29 @@ def test_pattern_without_a_variable_suggests_one(values: Path) -> None:
         select(sources, ["island-01/tmp"])
     with pytest.raises(ConfigError, match=r"'zzz'; recorded variables: island-01/temp, .* and 4"):
         select(sources, ["zzz"])
+
+
+def test_frames_damaged_before_their_end_are_not_cut_off(tmp_path: Path, frames: Path) -> None:
+    octets = bytearray(frames.read_bytes())
+    middle = len(octets) // 8 * 4
+    octets[middle : middle + 400] = bytes(400)
+    path = tmp_path / "hole.pcapng"
+    path.write_bytes(octets)
+    with pytest.raises(MalformedError, match=r"packets follow at \d+: nothing is cut"):
+        finish_recording(path)
+    assert path.read_bytes() == octets
+
+
+def test_values_damaged_before_their_end_are_not_cut_off(tmp_path: Path) -> None:
+    path, hole = tmp_path / "a.mcap", tmp_path / "hole.mcap"
+    writer = begin_values(path, 500)
+    octets = path.read_bytes() + b"\xff" * (5 << 20)
+    writer.close()
+    hole.write_bytes(octets)
+    with pytest.raises(MalformedError, match=r"damaged, and \d+ bytes follow: nothing is cut"):
+        finish_recording(hole)
+    assert hole.stat().st_size == len(octets)
+    # As a power cut may leave it.
+    hole.write_bytes(octets.rstrip(b"\xff") + bytes(5 << 20))
+    assert finish_recording(hole) == 5 << 20
+    assert describe(hole).finished
