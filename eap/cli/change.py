@@ -236,7 +236,7 @@ def plan_lines(
         yield from (f"  * {note}" for note in each.notes)
         yield from (f"  ! {reason}" for reason in each.refused)
     if differing:
-        yield from _plan_summary(report)
+        yield from _plan_summary(report, hosts)
     elif plans:
         names = [each.station for each in plans]
         all_of = f"{names[0]} is" if len(names) == 1 else f"all {len(names)} stations are"
@@ -256,8 +256,7 @@ def _away_lines(away: Iterable[AwayHost]) -> Iterator[str]:
         yield f"host {host.host} ({', '.join(host.stations)}): {host.reason}"
 
 
-def _plan_summary(report: PlanReport) -> Iterator[str]:
-
+def _plan_summary(report: PlanReport, hosts: Mapping[str, str]) -> Iterator[str]:
     differing = [each for each in report.stations if each.differs]
     refusing = [each.station for each in differing if each.refused]
     kinds = [change.change for each in differing for change in each.changes]
@@ -275,7 +274,7 @@ def _plan_summary(report: PlanReport) -> Iterator[str]:
     elif len(report.steps) > 1:
         yield "'eapctl apply' takes these steps:"
         for number, step in enumerate(report.steps, 1):
-            yield f"  {number}. {step.station} {step.why}"
+            yield f"  {number}. {_on_host(step.station, hosts)} {step.why}"
 
 
 def change_text(change: ObjectChange, name: str) -> str:

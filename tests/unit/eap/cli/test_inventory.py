@@ -110,3 +110,15 @@ def test_run_starts_the_stations_of_one_host(
     result = CliRunner().invoke(main, ["run", str(plant), *options])
     assert result.exit_code == 2
     assert reason in result.stderr
+
+
+def test_example_of_the_page_is_right(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[4] / "docs/commands.md").read_text()
+    example = page[page.index("$ eapctl inventory line.yaml\n") :].splitlines()[1]
+    path = tmp_path / "line.yaml"
+    text = PLANT.replace("hall-2", "line").replace("10.0.0.1", "10.0.0.11")
+    before, _, rest = text.partition("  - {name: cell-b")
+    stations = rest.partition("\n")[2].partition("  - name: panel")[0]
+    path.write_text(before + stations)
+    result = CliRunner().invoke(main, ["inventory", str(path)])
+    assert result.stdout == example.replace("/etc/eap/line.yaml", str(path)) + "\n"

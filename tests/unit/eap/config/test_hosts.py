@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import re
 from ipaddress import IPv4Address
+from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
+from eap.ams.spec import AccessService
 from eap.config.hosts import find_host, has_address, is_served_on
 from eap.config.load import load
 from eap.config.plant_sections import HostSection
@@ -12,6 +15,7 @@ from eap.config.web_sections import MetricsSection, WebSection
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri
 
+DOCS = Path(__file__).parents[4] / "docs"
 PLANT = """\
 plant: line
 hosts:
@@ -245,3 +249,42 @@ def test_addresses_of_a_host_may_be_networks():
     assert not is_served_on(HOSTS[0], "10.2.3.4:8080")
     assert is_served_on(HOSTS[0], "0.0.0.0:8080")
     assert is_served_on(HOSTS[0], "[::1]:8080")
+
+
+def test_plant_of_the_page_is_right(tmp_path):
+    page = (DOCS / "several-hosts.md").read_text()
+    (text,) = [each for each in yaml_blocks(page) if each.startswith("plant:")]
+    path = tmp_path / "line.yaml"
+    path.write_text(text)
+    result = load(path, lambda _: ())
+    assert (result.findings, result.warnings) == ((), ())
+    (rule,) = [each for each in yaml_blocks(page) if each.startswith("    access:")]
+    panel = "  - name: panel\n"
+    path.write_text(text.replace(panel, panel + rule))
+    plant = load(path, lambda _: ()).plant
+    assert [each.services for each in plant.routing["panel"].access] == [(AccessService.CONFIGURE,)]
+    # Routes between the hosts follow from the addresses of the ports.
+    assert [each.hop.address for each in plant.routing["oven"].routes] == ["10.77.0.2:34980"]
+
+
+def test_hosts_of_the_reference_are_right(tmp_path):
+    page = (DOCS / "plant-file.md").read_text()
+    (text,) = [each for each in yaml_blocks(page) if each.startswith("hosts:")]
+    stations = "".join(
+        f"""
+  - name: {name}
+    net_id: 10.0.0.{number}.1.1
+    ports:
+      - {{name: eap0, kind: eap, interface: "udp://10.0.0.{number}", net_id: 10.0.0.{number}.2.1}}
+      - {{name: eap1, kind: eap, interface: "ethernet://lan", net_id: 10.0.0.{number}.3.1}}"""
+        for number, name in enumerate(("oven", "panel", "lamp"), 11)
+    )
+    path = tmp_path / "plant.yaml"
+    path.write_text(f"plant: line\n{text}stations:{stations}\n")
+    result = load(path, lambda _: ())
+    assert result.findings == ()
+    assert result.plant.stations[0].ports[1].interface.host == "enp3s0"
+
+
+def yaml_blocks(page):
+    return re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
