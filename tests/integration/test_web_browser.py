@@ -459,6 +459,19 @@ def test_paper_has_the_panels_alone(tab: Callable[..., Tab]):
     assert len(page.pdf()) > 10_000
 
 
+def test_table_fits_on_paper_with_the_date_and_its_values_on_phones(tab: Callable[..., Tab]):
+    page = tab(viewport={"width": 390, "height": 844}).open("page/Variables")
+    value = page.locator(".variables td.number").first.bounding_box()
+    assert value is not None
+    assert value["x"] + value["width"] < 390
+    page.set_viewport_size({"width": 718, "height": 1000})  # A4
+    page.emulate_media(media="print")
+    assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
+    assert page.locator("#clock").is_visible()
+    date = page.locator("#clock").get_attribute("data-date") or ""
+    assert re.fullmatch(r"20\d\d-\d\d-\d\d", date)
+
+
 def test_page_of_a_plant_that_does_not_run_says_so(
     folder: Plants, chromium: Browser, tmp_path: Path
 ):

@@ -131,7 +131,7 @@ class App {
   #showPlant({ plant, findings, unreachable, time }) {
     setText(byId("plant"), plant || this.session.plant || "EAP");
     setText(byId("clock"), formatTime(time));
-    setAttribute(byId("clock"), "data-date", new Date(time * 1000).toLocaleDateString(language)); // on paper
+    setAttribute(byId("clock"), "data-date", new Date(time * 1000).toLocaleDateString("sv")); // on paper; as ISO 8601
     const silent = Object.entries(unreachable ?? {}).map(([name, why]) => (why.startsWith(`${name}: `) ? why : `${name}: ${why}`));
     const count = (severity) => findings.filter((each) => each.severity === severity).length;
     const [errors, warnings] = [count("error") + silent.length, count("warning")];
