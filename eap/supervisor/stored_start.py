@@ -16,7 +16,6 @@ from eap.pd.image import format_image
 from eap.pd.layout import plan_layout
 from eap.pd.spec import PortKind, StationSpec
 from eap.pd.station import Station
-from eap.runtime.busfile import load_or_raise
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import Handover
 from eap.runtime.store import effective
@@ -84,6 +83,8 @@ def find_missing_slaves(spec: StationSpec, folder: ApplianceFolder) -> list[str]
         if bus is None or not bus.simulated or folder.segment(bus.simulated).exists():
             continue
         try:
+            from eap.runtime.busfile import load_or_raise  # simulated devices, hardly ever needed
+
             load_or_raise(Path(bus.file))
         except ConfigError as exc:
             reasons.append(f"port {port.name}: {str(exc).splitlines()[0]}")

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections import OrderedDict
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
-from xml.sax.saxutils import quoteattr
 
 from eap.codec.ams import AmsCommand, AmsHeader, AmsTcpHeader, StateFlags, encode_with_prefix
 from eap.errors import MalformedError, TruncatedError
@@ -133,6 +132,8 @@ class Info(NamedTuple):
 
 def encode_info(info: Info) -> bytes:
     """Return the message that carries *info*."""
+    from xml.sax.saxutils import quoteattr  # with urllib and email; only brokers get such messages
+
     more = ' unidirectional="true"' if info.is_unidirectional else ""
     word = "true" if info.is_online else "false"
     attributes = f'name={quoteattr(info.name)} osPlatform="{_UNIX}"{more}'
