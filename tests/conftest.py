@@ -183,9 +183,10 @@ def _spread(items: list[pytest.Item]) -> None:
 
 
 _LONGEST = (
-    "discover", "eap_device", "routes", "bus_ports", "change_plant", "mqtt", "paths", "subscribers",
-    "processes", "live_frames", "refusals", "gateway", "ring", "kickcat", "hostile_hosts",
-    "trace_hops", "gateway_elsewhere", "bus_station", "routes_ethernet", "scan_plant",
+    "web_browser", "paths", "live_frames", "subscribers", "processes", "change_ports", "eap_device",
+    "discover", "hostile_hosts", "recording", "opcua", "mqtt", "change_plant", "bus_ports", "ring",
+    "gateway", "routes", "kickcat", "refusals", "mailboxes_over_frames", "web", "trace_hops",
+    "gateway_elsewhere", "bus_station", "routes_ethernet", "scan_plant",
     "killed_processes", "from_twincat", "mqtt_docs", "pyads_clients", "hostile_slaves",
     "lasting_subscriptions", "blank_station", "slaves_by_ads", "routes_docs",
 )  # fmt: skip
