@@ -291,7 +291,7 @@ class PlantServer(InternalServer):  # type: ignore[misc]
         self.max_monitored_item_queue_size = _MAX_QUEUE
         self.max_unacked_messages_per_subscription = _MAX_UNACKNOWLEDGED
         self.max_session_timeout_ms = 120_000
-        self.max_pending_activation_seconds = 15.0
+        self.max_pending_activation_seconds = 30.0
 
     def create_session(self, name: Any, user: Any = None, external: bool = False) -> PlantSession:
         """Return a new session, whose token cannot be guessed."""
