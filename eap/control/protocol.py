@@ -205,9 +205,9 @@ class VariableRow(Document, frozen=True):
 class Values(Document, frozen=True):
     """Answer to ``read``: values of one moment.
 
-    *quality* is that of received variables, in units of 100 us; None before the first time.
-    *stale* has those of them whose PD does not arrive any more.  *time_ns* is the Unix time of the
-    cycle; 0 from an appliance of an older release.
+    *quality* is that of received variables and of those read from controllers, in units of 100 us;
+    None before the first time.  *stale* has those of them that do not arrive any more.  *time_ns*
+    is the Unix time of the cycle; 0 from an appliance of an older release.
     """
 
     station: str

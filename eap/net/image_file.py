@@ -351,10 +351,10 @@ class StationImage:
         """
         while True:
             file = self.file
-            octets = {name: file.image.encode(name, value) for name, value in values.items()}
+            fresh = file.image.updated_region(writer, values)
+            # One copy: a cycle that begins within this block goes on with the values before.
             with file.image.writing(writer):
-                for name, each in octets.items():
-                    file.image.store(name, each)
+                file.image.region(writer)[:] = fresh
             # A write that came too late for the handover is made again in the new file.
             if not file.retired:
                 return

@@ -19,7 +19,7 @@ This module works on any writable buffer; ``eap.net.image_file`` maps one from a
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -125,6 +125,23 @@ class Image:
         """Return the variables of *writer*, live."""
         slot = self.layout.regions[writer]
         return self.memory[slot.offset : slot.offset + slot.size]
+
+    def updated_region(self, writer: Writer, values: Mapping[str, Any]) -> bytearray:
+        """Return a copy of the region of *writer*, who calls this, with *values* in it.
+
+        Raises:
+            ValueError: a value does not fit its type.
+            ImageError: there is no such variable, or another writer has it.
+        """
+        fresh, start = bytearray(self.region(writer)), 8 * self.layout.regions[writer].offset
+        view = memoryview(fresh)
+        for name, value in values.items():
+            slot = self.slot(name)
+            if slot.writer is not writer:
+                raise ImageError(f"{name} is written by the {slot.writer}, not by the {writer}")
+            kind = datatypes.parse(slot.type)
+            put(view, slot.bit_offset - start, kind.bit_length, kind.encode(value))
+        return fresh
 
     def read(self, name: str) -> Any:
         """Return one variable's value; raise ImageError if there is none of that name."""

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -418,13 +419,15 @@ def test_values_written_while_the_image_changes_are_in_the_new_one(
     station_image, move, monkeypatch
 ):
     station_image.acquire_writer(Writer.APPLICATION)
-    store = station_image.image.store
+    writing = station_image.image.writing
 
-    def store_late(name, octets):
-        store(name, octets)
+    @contextmanager
+    def write_late(writer):
+        with writing(writer):
+            yield
         move()  # the engine has copied what there was before
 
-    monkeypatch.setattr(station_image.image, "store", store_late)
+    monkeypatch.setattr(station_image.image, "writing", write_late)
     station_image.write(Writer.APPLICATION, {"running": True})
     assert "more0" in station_image.image.slots
     assert station_image.image.read("running") is True

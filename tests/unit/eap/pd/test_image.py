@@ -576,3 +576,14 @@ def test_image_remembers_a_bounded_number_of_parts(monkeypatch):
     for index in range(60):
         image.read(f"v[{index}]")
     assert len(image._parts) <= 10
+
+
+def test_region_is_updated_by_its_own_writer_only():
+    image = image_of(station(variables=written("on:BOOL", "bit:BIT2", "speed:REAL")))
+    before = bytes(image.region(Writer.APPLICATION))
+    fresh = image.updated_region(Writer.APPLICATION, {"bit": 2, "speed": 1.5})
+    assert bytes(image.region(Writer.APPLICATION)) == before
+    image.region(Writer.APPLICATION)[:] = fresh
+    assert image.read_all() == {"on": False, "bit": 2, "speed": 1.5}
+    with pytest.raises(ImageError, match="is written by the application, not by the services"):
+        image.updated_region(Writer.SERVICES, {"on": True})
