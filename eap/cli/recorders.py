@@ -303,8 +303,8 @@ def _table(states: Iterable[RecordingState]) -> Iterator[RenderableType]:
             duration(int(max(0.0, until - state.started_at) * 1e6)),
             str(state.messages),
             _size(state.octets),
-            str(state.lost),
-            state.files[-1] if state.files else "",
+            str(state.lost + state.not_stored),
+            state.files[-1] if state.files else state.options.get("to", ""),
         )
     yield table
     for state in rows:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from eap.quantities import count, duration
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from eap.ops.replay import ReplayResult
+    from eap.ops.replay import Replay, ReplayRequest, ReplayResult
     from eap.recording.replay import ReplayFrame
 
 
@@ -91,14 +92,38 @@ def replay(
     )
     running = Replay(request)
     if not dry_run:
-        ends = (signal.SIGINT, signal.SIGTERM)
-        before = [signal.signal(each, lambda *_: running.stopped.set()) for each in ends]
-        try:
-            running.run(_wait_step if step else None)
-        finally:
-            for each, handler in zip(ends, before, strict=True):
-                signal.signal(each, handler)
+        _run(running, request, is_stepped=step)
     output.show(running.result(), planned_view if dry_run else sent_view)
+
+
+def _run(running: Replay, request: ReplayRequest, *, is_stepped: bool) -> None:
+    """Send all frames, until the end or a signal."""
+
+    def end(*_: object) -> None:
+        running.stopped.set()
+        if is_stepped:
+            raise KeyboardInterrupt  # without it Python goes on to wait for the line
+
+    def report() -> None:
+        click.echo(_begin_text(running.result(), request), err=True)
+
+    ends = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(each, end) for each in ends]
+    try:
+        with suppress(KeyboardInterrupt):
+            running.run(_wait_step if is_stepped else None, notify_begin=report)
+    finally:
+        for each, handler in zip(ends, before, strict=True):
+            signal.signal(each, handler)
+
+
+def _begin_text(result: ReplayResult, request: ReplayRequest) -> str:
+    publishers = {row.publisher for row in result.frames}
+    again = " again and again" if request.is_loop else ""
+    return (
+        f"{result.file}: sending {result.seconds / request.rate:.1f} s of"
+        f" {count(len(publishers), 'publisher')}{again}; Ctrl-C ends it"
+    )
 
 
 def _wait_step(frame: ReplayFrame) -> bool:

@@ -153,8 +153,17 @@ class Replay:
             failed=self.progress.failed,
         )
 
-    def run(self, wait_step: Callable[[ReplayFrame], bool] | None = None) -> None:
-        """Send all frames; *wait_step* is called before each one and returns False to end.
+    def run(
+        self,
+        wait_step: Callable[[ReplayFrame], bool] | None = None,
+        *,
+        notify_begin: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Send all frames.
+
+        Args:
+            wait_step: Called before each frame; returns False to end.
+            notify_begin: Called when the first frame is about to be sent.
 
         Raises:
             LocalProtocolError: a publisher is alive.
@@ -170,6 +179,7 @@ class Replay:
             }
             stack.enter_context(ReplayStatus(plant, self._plan, self.progress, self.stopped.set))
             clock = ReplayClock(self._request.rate)
+            notify_begin()
             while not self.stopped.is_set():
                 clock.begin_round(time.monotonic_ns())
                 self._send_round(clock, senders, wait_step)

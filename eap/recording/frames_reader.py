@@ -19,7 +19,7 @@ from eap.recording.frames_writer import (
     HEADER_COMMENT,
     PUBLISHED_COMMENT,
 )
-from eap.recording.header import AttachedFile, EventKind, RecordingEvent
+from eap.recording.header import AttachedFile, EventKind, RecordingEvent, check_format
 from eap.recording.messages import PlacedVariable, StationMessages, read_leaf
 from eap.recording.packets import Packet, cut_frames, unwrap
 from eap.recording.published import RecordedFrame, RecordedPd, decode_published
@@ -242,6 +242,7 @@ def _section(
                 facts = msgspec.json.decode(head[len(HEADER_COMMENT) :], type=dict[str, str])
             except msgspec.MsgspecError as exc:
                 raise MalformedError(f"damaged comment: {exc}", layout=str(path)) from None
+            check_format(facts, str(path))
         elif head.startswith(PUBLISHED_COMMENT):
             published += part
         elif head.startswith(FILE_COMMENT):

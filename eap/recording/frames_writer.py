@@ -133,6 +133,7 @@ def section_header(header: RecordingHeader) -> bytes:
         "format": FORMAT,
         "plant": header.plant,
         "host": header.host,
+        "release": RELEASE,
         "started_ns": str(header.started_ns),
         **header.options,
     }

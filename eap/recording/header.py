@@ -2,14 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
 
 from msgspec import Struct
 
+from eap.errors import MalformedError
 from eap.recording.published import RecordedFrame
+from eap.release import RELEASE
 
 FORMAT = "1"
 """Version of what this project writes into MCAP and pcapng files beside values and frames."""
+
+
+def check_format(facts: Mapping[str, str], name: str) -> None:
+    """Check that a recording is of the format that this release reads.
+
+    Args:
+        facts: Of its header; empty for a file of another program.
+        name: Of the file, for the message.
+
+    Raises:
+        MalformedError: it is of another one.
+    """
+    found = facts.get("format", FORMAT)
+    if found != FORMAT:
+        release = facts.get("release", "another one")
+        raise MalformedError(
+            f"recording of format {found}, and release {RELEASE} reads format {FORMAT}: use the"
+            f" release that recorded it ({release})",
+            layout=name,
+        )
 
 
 class AttachedFile(Struct, frozen=True):

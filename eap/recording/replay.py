@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 _PUBLISHER = slice(PD_FRAME_START, PD_FRAME_START + 6)
 _CYCLE = slice(CYCLE_OFFSET, CYCLE_OFFSET + 2)
+_LONE_NS = 1_000_000_000
+"""Time of a round of a recording that has a single moment."""
 
 
 class ReplaySender(NamedTuple):
@@ -280,7 +282,7 @@ class ReplayClock:
         if self._first_ns is None:
             self._start_ns = now_ns
         else:
-            self._start_ns += round((self._span_ns + self._step_ns) / self._rate)
+            self._start_ns += round((self._span_ns + self._step_ns or _LONE_NS) / self._rate)
             self._is_first_of = set(self._cycles)
         self._first_ns = None
         self._span_ns = 0

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from eap.errors import MalformedError
-from eap.recording.header import AttachedFile, EventKind, RecordingEvent
+from eap.recording.header import AttachedFile, EventKind, RecordingEvent, check_format
 from eap.recording.mcap_file import McapChannel, McapFile
 from eap.recording.messages import RecordedVariable, StationMessages, pack_closely
 from eap.recording.published import RecordedFrame, decode_published
@@ -49,6 +49,7 @@ class ValuesFile:
             raise MalformedError(
                 "an MCAP file, but no recording of eapctl", layout=str(path), offset=0
             )
+        check_format(self.facts, str(path))
         self.files: list[AttachedFile] = []
         self.published: tuple[RecordedFrame, ...] = ()
         for each in content.attachments:

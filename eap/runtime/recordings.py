@@ -214,8 +214,14 @@ def _finding(state: RecordingState, now_s: float) -> dict[str, Any] | None:
     elif state.lost:
         severity, what = "warning", f"{what}, {state.lost} lost"
         advice = "the machine is too busy for it: record less, or each N-th cycle by --every"
+    elif state.not_stored:
+        severity = "warning"
+        what = ": ".join(filter(None, (f"{what}, {state.not_stored} not stored", state.reason)))
+        advice = "the store was away for too long, or is too slow: see its log, or record less"
     elif state.reason:
         what = f"{what}: {state.reason}"
+        if state.state == "recording":
+            severity, advice = "warning", "rows wait in memory until the store answers"
     return {
         "severity": severity,
         "where": f"recording {state.name}",

@@ -118,6 +118,9 @@ def test_killed_recordings_of_values_and_frames_have_the_same_values(kept: Kept)
     # The values of every second cycle are sent, and both recorders lost up to a second.
     assert len(common) > 50
     assert {key: values[key] for key in common} == {key: frames[key] for key in common}
+    # A killed recorder ends earlier than the other one: what was sent before that is in both.
+    ends = min(map(int, values)), max(map(int, values))
+    assert common == {key for key in frames if ends[0] <= int(key) <= ends[1]}
     assert len({wave for wave, _ in values.values()}) > 20
     assert {note for _, note in values.values()} == {"ab,c"}
     picture = kept.folder / "x.svg"
@@ -199,6 +202,26 @@ def test_step_sends_a_frame_for_each_line(kept: Kept, tmp_path: Path) -> None:
     )
     assert json.loads(done.stdout)["sent"] == 3
     assert done.stderr.count("left/eap0 → 127.9.62.2: state") == 4
+
+
+def test_step_ends_by_ctrl_c_while_it_waits_for_a_line(kept: Kept, tmp_path: Path) -> None:
+    words = [*EAPCTL, "replay", str(kept.values), "--step", "--json"]
+    replay = subprocess.Popen(
+        words,
+        env=os.environ | {"EAP_RUNTIME_DIR": str(tmp_path)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert replay.stdin is not None
+    assert replay.stderr is not None
+    assert "sending" in replay.stderr.readline()
+    assert replay.stderr.read(4) == "left"
+    replay.send_signal(signal.SIGINT)
+    assert replay.wait(timeout=30) == 0
+    out, _ = replay.communicate()
+    assert json.loads(out)["sent"] == 0
 
 
 def test_dry_run_sends_nothing_and_names_every_frame(kept: Kept, tmp_path: Path) -> None:

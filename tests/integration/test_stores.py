@@ -97,7 +97,7 @@ def test_store_that_does_not_answer_at_the_start_is_an_error(mill: Appliance) ->
 
 def test_other_options_contradict_a_store(mill: Appliance) -> None:
     words = ["record", "start", "--frames", "--to", "postgresql://h/x"]
-    assert "--to takes values as they come" in run_eapctl(mill.runtime, *words).stderr
+    assert "--to: a store takes values as they come" in run_eapctl(mill.runtime, *words).stderr
     done = run_eapctl(mill.runtime, "record", "start", "--to", "oracle://h/x")
     assert (done.returncode, "expected a store" in done.stderr) == (2, True)
     assert os.environ.get("EAP_RECORD_TO") is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,27 @@ def test_values_are_read_in_the_order_of_their_times(values: Path) -> None:
     size = len(sample(0))
     assert [messages.sample(row.values, size) for row in own] == [sample(n) for n in range(300)]
     assert [row.values for row in rows if row.source == second] == [[n] for n in range(0, 300, 2)]
+
+
+@pytest.mark.parametrize(
+    ("writer", "write", "name"),
+    [
+        ("values_writer", write_values, "later.mcap"),
+        ("frames_writer", write_frames, "later.pcapng"),
+    ],
+)
+def test_recording_of_a_later_format_is_refused_with_its_release(
+    writer: str,
+    write: Callable[[Path], Path],
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(f"eap.recording.{writer}.FORMAT", "2")
+    monkeypatch.setattr(f"eap.recording.{writer}.RELEASE", "7.1")
+    path = write(tmp_path / name)
+    with pytest.raises(MalformedError, match=r"of format 2, .* use the release .* \(7\.1\)"):
+        open_recording(path)
 
 
 def test_columns_are_parts_of_variables(values: Path) -> None:

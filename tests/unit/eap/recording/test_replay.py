@@ -154,3 +154,12 @@ def test_clock_numbers_cycles_beyond_16_bits() -> None:
         clock.begin_round(0)
         cycles += [cycle_of(clock.numbered(each)) for each in frames if clock.due_ns(each) >= 0]
     assert cycles == [65_530, 65_532, 65_534, 0, 2, 4, 6, 8]
+
+
+def test_clock_repeats_a_single_frame_once_a_second() -> None:
+    clock = ReplayClock(2)
+    times = []
+    for _ in range(3):
+        clock.begin_round(0)
+        times.append(clock.due_ns(replayed(700, 1)))
+    assert times == [0, 500 * MS, 1_000 * MS]

@@ -77,6 +77,16 @@ def test_recordings_that_ended_long_ago_are_forgotten():
         ({"state": "waiting", "reason": "it is away"}, "info", "waiting, 3 variables: it is away"),
         ({"state": "recording", "lost": 7}, "warning", "recording, 3 variables, 7 lost"),
         (
+            {"state": "recording", "reason": "no answer"},
+            "warning",
+            "recording, 3 variables: no answer",
+        ),
+        (
+            {"state": "recording", "not_stored": 5, "reason": "no answer"},
+            "warning",
+            "recording, 3 variables, 5 not stored: no answer",
+        ),
+        (
             {"state": "ended", "reason": "disk full", "failed": True, "ended_at": 90.0},
             "warning",
             "ended: disk full",
