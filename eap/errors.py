@@ -19,6 +19,12 @@ EapError
 from __future__ import annotations
 
 
+def describe_os_error(error: OSError) -> str:
+    """Return an error of the system in words: its file, if it names one, and the reason."""
+    reason = error.strerror or str(error) or type(error).__name__
+    return f"{error.filename}: {reason}" if isinstance(error.filename, str) else reason
+
+
 class EapError(Exception):
     """Base class; catch this at the edge of the process.
 

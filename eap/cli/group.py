@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 
 import click
 
-from eap.errors import ConfigError, EapError, EnvironmentalError
+from eap.errors import ConfigError, EapError, EnvironmentalError, describe_os_error
 from eap.suggest import suggest
 
 DEBUG_VARIABLE = "EAP_DEBUG"
@@ -133,7 +133,9 @@ def describe(error: Exception) -> str:
         text = error.format_message()
     elif isinstance(error, click.Abort):
         text = "interrupted"
-    elif isinstance(error, (EapError, OSError)):
+    elif isinstance(error, OSError):
+        text = describe_os_error(error)
+    elif isinstance(error, EapError):
         text = str(error) or type(error).__name__
     else:
         text = f"unexpected {type(error).__name__}: {error} ({DEBUG_VARIABLE}=1 shows where)"

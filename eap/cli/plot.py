@@ -78,7 +78,7 @@ def plot(
 
     Values of one unit share a chart.  VAR is a variable, a part of one, or a pattern with * and ?.
     """
-    if Path(source).exists() or others:
+    if Path(source).exists() or others or _is_path(source):
         from eap.ops.plots import series_of_files
 
         files = [Path(source), *others]
@@ -94,6 +94,11 @@ def plot(
 
         write_chart(out, title, series, axis)
         click.echo(f"{out}: {len(series)} lines", err=True)
+
+
+def _is_path(source: str) -> bool:
+    """Return whether *source* is the path of a file: no station has such a name."""
+    return "/" in source or Path(source).suffix in {".mcap", ".pcapng", ".pcap"}
 
 
 def _watch(

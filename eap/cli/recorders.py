@@ -166,6 +166,8 @@ def start(
     from eap.ops.recorders import start_recording
     from eap.recording.recorder import RecorderOptions
 
+    if target is not None and not target.name:
+        raise click.UsageError("-o: a name is missing")
     times = RecordTimes(ring_ns or 0, before_ns or 0, after_ns or 0)
     has_files = any(split) or bool(keep)
     kind = kind or "values"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from eap.recording.recording_file import Recording
 
 STDOUT = "-"
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+"""Errors of a write, which name no file."""
 
 
 class ExportRequest(Struct, frozen=True, kw_only=True):
@@ -74,6 +77,10 @@ def export_recording(request: ExportRequest, stdout: Callable[[str], object]) ->
     try:
         count = _write(request, recording, window, part)
         part.replace(target)
+    except OSError as exc:
+        if exc.filename != str(part) and exc.errno not in _FULL:
+            raise
+        raise OSError(exc.errno, exc.strerror, str(target)) from None
     finally:
         part.unlink(missing_ok=True)
     return ExportResult(str(target), request.form, *count, recording.damaged_chunks)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from time import time_ns
 from typing import TypeAlias
 
-from eap.errors import EapError
+from eap.errors import EapError, describe_os_error
 from eap.recording.capture import CapturedBlock, Gap
 from eap.recording.files import FileSequence, OpenFile
 from eap.recording.header import RecordingEvent
@@ -112,7 +112,9 @@ class DiskThread:
                 if time_ns() >= flush_ns:
                     flush_ns = time_ns() + int(_FLUSH_S * 1e9)
                     self._files.flush()
-            except (OSError, EapError) as exc:
+            except OSError as exc:
+                self.failure = self.failure or describe_os_error(exc)
+            except EapError as exc:
                 self.failure = self.failure or str(exc)
             except Exception as exc:  # noqa: BLE001  without this thread nothing would be written
                 self.failure = self.failure or f"{type(exc).__name__}: {exc}"

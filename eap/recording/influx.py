@@ -51,7 +51,9 @@ class InfluxStore:
         if self._tables is tables:
             return
         self._plant, self._tables = plant, tables
-        if self._scheme != "influx+udp":
+        if self._scheme == "influx+udp":
+            self._resolved()  # tells at the start that the host is unknown
+        else:
             # An empty write is an answer, or tells at the start that there is none.
             self._post(b"")
 
@@ -73,11 +75,21 @@ class InfluxStore:
             if line := tables[row.table].line(row):
                 yield line
 
-    def _send(self, bodies: Iterable[bytes]) -> None:
+    def _resolved(self) -> tuple[int, Any]:
+        """Return address family and address of the host."""
         try:
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            found = socket.getaddrinfo(*self._address, type=socket.SOCK_DGRAM)
+        except OSError as exc:
+            raise StoreError(f"{self._address[0]}: {exc.strerror}") from None
+        family, _, _, _, address = found[0]
+        return family, address
+
+    def _send(self, bodies: Iterable[bytes]) -> None:
+        family, address = self._resolved()
+        try:
+            with socket.socket(family, socket.SOCK_DGRAM) as sock:
                 for body in bodies:
-                    sock.sendto(body, self._address)
+                    sock.sendto(body, address)
         except OSError as exc:
             raise StoreError(exc.strerror or str(exc)) from None
 

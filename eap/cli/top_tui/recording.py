@@ -14,7 +14,7 @@ from textual.containers import Horizontal, Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Button, Input, Static
 
-from eap.errors import EapError
+from eap.errors import EapError, describe_os_error
 from eap.live.rows import BusRow, PdFlow, StationRow
 from eap.quantities import count
 from eap.runtime.recordings import RecordingState
@@ -126,7 +126,9 @@ class RecordForm(ModalScreen[str]):
     def _begin(self, target: Path) -> None:
         try:
             text = self._start(self._thing, target)
-        except (EapError, OSError, msgspec.MsgspecError) as exc:
+        except OSError as exc:
+            self.app.call_from_thread(self._show_problem, describe_os_error(exc))
+        except (EapError, msgspec.MsgspecError) as exc:
             self.app.call_from_thread(self._show_problem, str(exc))
         else:
             self.app.call_from_thread(self.dismiss, text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from pathlib import Path
@@ -89,3 +90,28 @@ def test_export_prints_rows_and_columns(tmp_path: Path) -> None:
     assert lines.splitlines()[0] == "time_ns,island-01/b"
     assert len(lines.splitlines()) == 3
     assert "expected a form" in run("export", path).stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["record", "info", "a.mcap"], "a.mcap: No such file or directory"),
+        (["plot", "a.mcap", "temp"], "a.mcap: No such file or directory"),
+        (["plot", "logs/a", "temp"], "logs/a: No such file or directory"),
+        (["record", "start", "-o", ""], "-o: a name is missing"),
+    ],
+)
+def test_wrong_paths_are_named(words: list[str], problem: str) -> None:
+    assert problem in run(*words).stderr
+
+
+def test_export_to_a_full_disk_names_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("eap.ops.recordings.write_csv", fail)
+    result = run("export", write_values(tmp_path / "a.mcap"), "--csv", "-o", tmp_path / "x.csv")
+    assert result.stderr == f"{tmp_path}/x.csv: No space left on device\n"
+    assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Iterator, Sequence
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -210,6 +211,30 @@ def test_answer_tells_whether_another_attempt_helps(
     with pytest.raises(StoreError, match=f"HTTP {status}") as caught:
         store.open("p", TABLES)
     assert caught.value.is_final is is_final
+
+
+@pytest.mark.net
+@pytest.mark.parametrize(
+    ("family", "host"), [(socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1")]
+)
+def test_lines_go_by_udp(family: socket.AddressFamily, host: str) -> None:
+    with socket.socket(family, socket.SOCK_DGRAM) as receiver:
+        receiver.bind((host, 0))
+        receiver.settimeout(20)
+        shown = f"[{host}]" if ":" in host else host
+        store = InfluxStore(f"influx+udp://{shown}:{receiver.getsockname()[1]}")
+        store.open("p", TABLES)
+        store.write([StoreRow(0, T0, 1, [7])], [])
+        assert receiver.recv(100) == f"s,plant=p v=7i {T0}\n".encode()
+
+
+def test_unknown_host_is_noticed_by_udp_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", fail)
+    with pytest.raises(StoreError, match="nowhere: Name or service not known"):
+        InfluxStore("influx+udp://nowhere").open("p", TABLES)
 
 
 @pytest.mark.net
