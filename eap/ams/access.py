@@ -13,7 +13,7 @@ It also collects the audit entries: changes that were made, and requests that we
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from ipaddress import IPv4Address, IPv4Network
 from typing import NamedTuple
 
@@ -36,7 +36,14 @@ from eap.ads.request import (
 )
 from eap.ams.error_reply import RoutingError
 from eap.ams.record import Outcome, Record, Trace, describe
-from eap.ams.spec import IP_TRANSPORTS, AccessRule, AccessService, ObjectRange, TransportKind
+from eap.ams.spec import (
+    IP_TRANSPORTS,
+    AccessRule,
+    AccessService,
+    ObjectRange,
+    Role,
+    TransportKind,
+)
 from eap.codec.ads import AdsError, ConfigureOffset, IndexGroup
 from eap.codec.adsnotification import AddNotification
 from eap.codec.ams import AmsCommand, AmsHeader
@@ -187,17 +194,22 @@ class AccessList:
     ) -> None:
         self._rules = [_Matcher(rule) for rule in rules]
         self._own = frozenset(own)
-        self._known: dict[tuple[Endpoint, NetId, NetId, int], Grants] = {}
+        self._known: dict[tuple[Endpoint, NetId, NetId, int, Role | None], Grants] = {}
 
-    def grants(self, endpoint: Endpoint, source: NetId, target: NetId, port: int) -> Grants:
-        """Return the rights of the client at *endpoint* that uses the NetID *source*."""
-        key = endpoint, source, target, port
+    def grants(
+        self, endpoint: Endpoint, source: NetId, target: NetId, port: int, role: Role | None = None
+    ) -> Grants:
+        """Return the rights of the client at *endpoint* that uses the NetID *source*.
+
+        *role* is that of a user who has logged in; rules take other clients by their addresses.
+        """
+        key = endpoint, source, target, port, role
         grants = self._known.get(key)
         if grants is None:
             # Source NetIDs can be invented: the cache must not grow with them.
             if len(self._known) >= _MAX_KNOWN:
                 self._known.clear()
-            grants = self._known[key] = self._find(endpoint, source, target, port)
+            grants = self._known[key] = self._find(endpoint, source, target, port, role)
         return grants
 
     def is_this_host(self, endpoint: Endpoint) -> bool:
@@ -208,12 +220,14 @@ class AccessList:
         address = address_of(endpoint)
         return address is not None and (address.is_loopback or address in self._own)
 
-    def _find(self, endpoint: Endpoint, source: NetId, target: NetId, port: int) -> Grants:
+    def _find(
+        self, endpoint: Endpoint, source: NetId, target: NetId, port: int, role: Role | None
+    ) -> Grants:
         address = address_of(endpoint)
         rules = [
             each.rule
             for each in self._rules
-            if each.is_from(endpoint, address, source) and each.is_to(target, port)
+            if each.is_from(endpoint, address, source, role) and each.is_to(target, port)
         ]
         return Grants(rules, is_this_host=self.is_this_host(endpoint))
 
@@ -236,28 +250,45 @@ def host_of(endpoint: Endpoint) -> str:
     return "" if kind == TransportKind.LOCAL else endpoint.connection
 
 
+class _Senders:
+    """IPv4 networks and MAC addresses of clients."""
+
+    def __init__(self, texts: Iterable[str]) -> None:
+        parts = [(text, ":" in text or "-" in text) for text in texts]
+        self._networks = tuple(IPv4Network(text) for text, is_mac in parts if not is_mac)
+        self._macs = frozenset(str(MacAddr.parse(text)) for text, is_mac in parts if is_mac)
+        self.is_empty = not parts
+
+    def has(self, endpoint: Endpoint, address: IPv4Address | None) -> bool:
+        # Ethernet has no IP address: the MAC address alone identifies the peer.
+        if endpoint.kind == TransportKind.ETHERNET:
+            return endpoint.connection in self._macs
+        return address is not None and any(address in each for each in self._networks)
+
+
 class _Matcher:
     """Access rule with its addresses parsed."""
 
     def __init__(self, rule: AccessRule) -> None:
         self.rule = rule
-        self._networks = tuple(map(IPv4Network, rule.networks))
-        self._macs = frozenset(str(MacAddr.parse(text)) for text in rule.macs)
+        self._senders = _Senders(rule.networks + rule.macs)
+        self._members = _Senders(rule.members)
         self._net_ids = tuple(map(_prefix, rule.net_ids))
         self._targets = tuple((_prefix(each.net_id), each.port) for each in rule.targets)
 
-    def is_from(self, endpoint: Endpoint, address: IPv4Address | None, source: NetId) -> bool:
+    def is_from(
+        self, endpoint: Endpoint, address: IPv4Address | None, source: NetId, role: Role | None
+    ) -> bool:
         transports = self.rule.transports
         if transports and endpoint.transport not in transports and endpoint.kind not in transports:
             return False
         if self._net_ids and not source.startswith(self._net_ids):
             return False
-        if not (self._networks or self._macs):
-            return True
-        # Ethernet has no IP address: the MAC address alone identifies the peer.
-        if endpoint.kind == TransportKind.ETHERNET:
-            return endpoint.connection in self._macs
-        return address is not None and any(address in each for each in self._networks)
+        if self.rule.roles and not (
+            role in self.rule.roles if role else self._members.has(endpoint, address)
+        ):
+            return False
+        return self._senders.is_empty or self._senders.has(endpoint, address)
 
     def is_to(self, target: NetId, port: int) -> bool:
         return not self._targets or any(

@@ -151,6 +151,17 @@ class ObjectRange(SpecStruct, frozen=True):
         )
 
 
+class Role(StrEnum):
+    """Rights of a user, each with those of the ones before."""
+
+    VIEWER = "viewer"
+    """Sees everything."""
+    OPERATOR = "operator"
+    """Sets the variables that the plant file lets operators set."""
+    ENGINEER = "engineer"
+    """Sets every variable of the application."""
+
+
 class AccessTarget(SpecStruct, frozen=True):
     """Target of requests: a NetID, given by its first four, five or all six bytes.
 
@@ -177,6 +188,8 @@ class AccessRule(SpecStruct, frozen=True):
         targets: Of the requests.
         services: Kinds of operations.
         objects: Of a dictionary; a rule that has some is about nothing else.
+        roles: Of users: a client that has logged in fits by its role, any other one by *members*.
+        members: IPv4 networks and MAC addresses of the users with these roles.
     """
 
     name: str
@@ -188,14 +201,16 @@ class AccessRule(SpecStruct, frozen=True):
     services: tuple[AccessService, ...] = ()
     objects: tuple[ObjectRange, ...] = ()
     macs: tuple[str, ...] = ()
+    roles: tuple[Role, ...] = ()
+    members: tuple[str, ...] = ()
 
 
 class AmsUser(SpecStruct, frozen=True):
     """User that may add routes remotely; the first line of *password_file* is the password."""
 
     name: str
-    password_file: str
-    """Absolute path; read whenever it is needed."""
+    password_file: str = ""
+    """Absolute path, read whenever it is needed; empty for a user of the plant."""
 
 
 class TlsSpec(SpecStruct, frozen=True):

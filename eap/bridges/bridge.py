@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from time import time
 from typing import Any, Literal
 
+from eap.ams.spec import Role
 from eap.bridges.feed import BridgeFeed, Sample
 from eap.control.protocol import WRITE, AnswerT, Method, ParametersT, WriteOrigin
 from eap.errors import EapError
@@ -96,6 +97,7 @@ class Bridge:
         transport: Literal["mqtt", "opcua", "s7", "modbus"],
         host: str,
         user: str = "",
+        role: Role | None = None,
     ) -> None:
         """Write a variable of the application for a client.
 
@@ -105,11 +107,12 @@ class Bridge:
             transport: For access rules and the audit.
             host: Address of the client; of MQTT the topic.
             user: Its user, empty without login.
+            role: Of the user.
 
         Raises:
             EapError: it is refused, or the appliance does not answer; the reason is for the client.
         """
-        await self.write_all({name: value}, transport=transport, host=host, user=user)
+        await self.write_all({name: value}, transport=transport, host=host, user=user, role=role)
 
     async def write_all(
         self,
@@ -118,6 +121,7 @@ class Bridge:
         transport: Literal["mqtt", "opcua", "s7", "modbus"],
         host: str,
         user: str = "",
+        role: Role | None = None,
     ) -> None:
         """Write several variables as :meth:`write` does; those of one station all or none."""
         by_station: dict[str, dict[str, Any]] = {}
@@ -125,7 +129,7 @@ class Bridge:
             station, _, variable = name.partition("/")
             by_station.setdefault(station, {})[variable] = value
         self.status.received += len(values)
-        origin = WriteOrigin(user, host, transport=transport)
+        origin = WriteOrigin(user, host, transport=transport, role=role)
         left = len(values)
         try:
             for station, own in by_station.items():

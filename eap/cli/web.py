@@ -70,7 +70,7 @@ def web(plant: Path | None, hosts: tuple[str, ...], listen: str | None, user: st
 def _read(plant: Path | None, listen: str | None) -> tuple[str, WebSection]:
     from msgspec.structs import replace
 
-    from eap.config.users import Role
+    from eap.ams.spec import Role
     from eap.config.web import parse_listen
     from eap.config.web_sections import WebSection
 

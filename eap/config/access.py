@@ -13,6 +13,7 @@ from eap.ams.spec import (
     AccessService,
     AccessTarget,
     ObjectRange,
+    Role,
     TransportKind,
 )
 from eap.config.brokers import brokers_of, check_file
@@ -20,7 +21,7 @@ from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.ports import check_names
 from eap.config.routes import NET_ID_OCTETS, SectionError, net_ids_of, stations_without_prefix
-from eap.config.structs import AccessSection, PortSection, StationSection
+from eap.config.structs import AccessSection, PortSection, StationSection, UserSection
 from eap.ids import STATION_OCTETS, MacAddr, ObjectId
 from eap.pd.spec import PortKind
 from eap.suggest import suggest
@@ -56,6 +57,13 @@ def access_rules(index: Index, station: StationSection, shared: set[str]) -> Ite
             ),
             services=parse_services(access.allow or access.deny, allows=bool(access.allow)),
             objects=tuple(parse_objects(text) for text in access.objects),
+            roles=access.roles,
+            members=tuple(
+                parse_sender(text)
+                for user in index.plant.users
+                if user.role in access.roles
+                for text in user.networks
+            ),
         )
 
 
@@ -203,7 +211,23 @@ def check_access(index: Index, report: FindingReport, folder: Path) -> None:
             _check_order(index, station, shared, report)
         check_names(((user.at, user.name) for user in station.users), "user", report)
         for user in station.users:
-            check_file(f"{user.at}.password_file", user.password_file, report, folder)
+            _check_route_user(index, user, report, folder)
+
+
+def _check_route_user(index: Index, user: UserSection, report: FindingReport, folder: Path) -> None:
+    """Report a user that may add routes and has neither a file nor a password in the plant."""
+    if user.password_file:
+        check_file(f"{user.at}.password_file", user.password_file, report, folder)
+        return
+    known = {each.name: each for each in index.plant.users}
+    found = known.get(user.name)
+    expected = "password_file, or an engineer of the plant's users with a password"
+    if found is None:
+        message = f"user {user.name} is none of the plant's users{suggest(user.name, known)}"
+        report.add(user.at, message, expected)
+    elif found.role is not Role.ENGINEER or not found.password:
+        lack = "no password" if found.role is Role.ENGINEER else f"the role {found.role}"
+        report.add(user.at, f"user {user.name} has {lack}", expected)
 
 
 def _check_rule(
@@ -245,6 +269,10 @@ def _check_rule(
     try_all("net_ids", access.net_ids, lambda text: parse_source(index, text, shared))
     try_all("to", access.to, lambda text: parse_target(index, text, shared))
     try_all("objects", access.objects, parse_objects)
+    if access.roles and not index.plant.users:
+        message = "roles: the plant has no users"
+        report.add(f"{access.at}.roles", message, "users at the top level, or no such key")
+        is_fine = False
     known = _transports(station)
     if access.transports and access.doors:
         message = "access rule has both transports and doors"
@@ -307,6 +335,7 @@ def _covers(one: AccessRule, other: AccessRule) -> bool:
     """Return whether *one* matches every request that *other* matches."""
     return (
         _covers_senders(one, other)
+        and _all_in(one.roles, other.roles, lambda outer, inner: outer is inner)
         and _all_in(one.net_ids, other.net_ids, _is_prefix)
         and _all_in(
             one.transports, other.transports, lambda outer, inner: outer in {inner, _kind(inner)}

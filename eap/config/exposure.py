@@ -96,7 +96,7 @@ def _writing(index: Index) -> Iterator[Found]:
         for number, rule in enumerate(station.access):
             services = set(parse_services(rule.allow, allows=True)) if rule.allow else set()
             writes = ALL in rule.allow or services - {AccessService.READ}
-            if rule.allow and writes and not rule.networks:
+            if rule.allow and writes and not (rule.networks or rule.roles):
                 by = "of every host" if not rule.net_ids else "by its source NetID alone"
                 yield (
                     rule.at,
@@ -291,7 +291,8 @@ def _readable_files(index: Index, folder: Path) -> Iterator[tuple[str, str]]:
 def _secret_files(index: Index) -> Iterator[tuple[str, str]]:
     for station in index.plant.stations:
         for user in station.users:
-            yield f"{user.at}.password_file", user.password_file
+            if user.password_file:
+                yield f"{user.at}.password_file", user.password_file
         for route in brokers_of(station):
             if route.password_file:
                 yield f"{route.at}.password_file", route.password_file
@@ -325,5 +326,5 @@ def _is_loopback(host: str) -> bool:
 
 def _denies_the_rest(rule: AccessSection) -> bool:
     """Return whether a rule denies everything to all that no rule before it let through."""
-    is_general = not (rule.networks or rule.net_ids or rule.to or rule.objects)
+    is_general = not (rule.networks or rule.net_ids or rule.to or rule.objects or rule.roles)
     return is_general and ALL in rule.deny

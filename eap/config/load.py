@@ -58,6 +58,7 @@ from eap.config.opcua import check_opcua, resolved_opcua, warn_of_open_channels
 from eap.config.opcua_sections import OpcUaSection
 from eap.config.pd_keys import check_key_files
 from eap.config.plant_sections import HostSection, PlantFile
+from eap.config.plant_users import check_plant_users, with_shared_users
 from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
 from eap.config.record import check_recordings, records_of, resolved_recordings
 from eap.config.record_sections import RecordSection
@@ -78,9 +79,11 @@ from eap.config.structs import (
     PortSection,
     StationSection,
     SubscribeSection,
+    UserSection,
     VariableSection,
 )
 from eap.config.types import TypeTable, resolve_types
+from eap.config.users import PlantUserSection
 from eap.config.variables import check_variables
 from eap.config.web import check_web, resolved, resolved_tls, warn_of_pictures
 from eap.config.web_sections import MetricsSection, WebSection
@@ -405,14 +408,15 @@ def derive_routing(index: Index, folder: Path) -> dict[str, RoutingSpec]:
             ),
             mqtt=tuple(broker_spec(each, folder) for each in brokers_of(station)),
             access=tuple(access_rules(index, station, shared)),
-            users=tuple(
-                AmsUser(user.name, str((folder / user.password_file).resolve()))
-                for user in station.users
-            ),
+            users=tuple(AmsUser(user.name, _password_file(user, folder)) for user in station.users),
             learn=discovery_sources(station),
         )
         for station in index.plant.stations
     }
+
+
+def _password_file(user: UserSection, folder: Path) -> str:
+    return str((folder / user.password_file).resolve()) if user.password_file else ""
 
 
 def derive_directory(index: Index) -> tuple[DirectoryStation, ...]:
@@ -502,6 +506,10 @@ class Plant(msgspec.Struct, frozen=True):
     """Names of the stations, ports and slaves of the plant."""
     audit_required: bool = False
     """True if changes that cannot be recorded are refused."""
+    users: tuple[PlantUserSection, ...] = ()
+    """Users of all stations and servers; empty if programs of this host may do everything."""
+    operators: tuple[str, ...] = ()
+    """Patterns of the variables that operators set by the control socket."""
     hosts: tuple[HostSection, ...] = ()
     """Computers that run the stations; empty for a plant of one."""
     web: WebSection | None = None
@@ -536,7 +544,7 @@ def _bridges(index: Index, folder: Path) -> dict[str, msgspec.Struct]:
     if (mqtt := index.plant.mqtt) is not None:
         found[mqtt.KEY] = mqtt_spec(index, mqtt, folder)
     if (opcua := index.plant.opcua) is not None:
-        found[opcua.KEY] = resolved_opcua(opcua, folder)
+        found[opcua.KEY] = resolved_opcua(opcua, folder, index.plant.access.operators)
     return found | field_bridges(index)
 
 
@@ -570,6 +578,7 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
     if plant_file is None:
         return PlantResult(None, report.findings())
     report.stations |= {station.name for station in plant_file.stations}
+    plant_file = with_shared_users(plant_file)
     plant_file, types = resolve_types(plant_file, report, path.parent)
     index = Index(plant_file, describe_buses(plant_file, path.parent, describe_bus, report))
     check_ports(index, report)
@@ -583,6 +592,7 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
     check_routes(index, report, path.parent)
     check_discovery(index, report)
     check_access(index, report, path.parent)
+    check_plant_users(index, report)
     check_web(index, report, path.parent)
     check_mqtt(index, report, path.parent)
     check_opcua(index, report, path.parent)
@@ -600,6 +610,8 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
         derive_routing(index, folder),
         derive_directory(index),
         audit_required=plant_file.access.audit is AuditMode.REQUIRED,
+        users=plant_file.users,
+        operators=plant_file.access.operators,
         hosts=plant_file.hosts,
         web=plant_file.web and resolved(plant_file.web, path.parent),
         metrics=plant_file.metrics and resolved_tls(plant_file.metrics, path.parent),

@@ -6,12 +6,13 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
+from eap.ams.spec import Role
 from eap.config.brokers import check_file
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index
 from eap.config.opcua_sections import ChannelSecurity, OpcUaSection
 from eap.config.selection import VariableNames, reason_not_settable
-from eap.config.users import Role, check_users
+from eap.config.users import check_users
 from eap.config.web import parse_listen
 
 _LISTEN = "ADDRESS:PORT, such as 127.0.0.1:4840 or [::1]:4840"
@@ -35,8 +36,12 @@ def role_of_anonymous(opcua: OpcUaSection) -> Role | None:
     return Role.ENGINEER
 
 
-def resolved_opcua(opcua: OpcUaSection, folder: Path) -> OpcUaSection:
-    """Return *opcua*, which has no findings, with the paths of its files from *folder* on."""
+def resolved_opcua(opcua: OpcUaSection, folder: Path, operators: tuple[str, ...]) -> OpcUaSection:
+    """Return *opcua*, which has no findings, with the paths of its files from *folder* on.
+
+    *operators* are the variables of operators where it names none itself.
+    """
+    opcua = replace(opcua, operators=opcua.operators or operators)
     if not opcua.certificate:
         return opcua
     certificate, key = (str((folder / each).resolve()) for each in (opcua.certificate, opcua.key))
@@ -49,7 +54,7 @@ def check_opcua(index: Index, report: FindingReport, folder: Path) -> None:
     if opcua is None:
         return
     _check_listen(opcua, report)
-    check_users(opcua.users, report)
+    check_users(opcua.users, report, shared=index.plant.users)
     names = VariableNames(index, report)
     for position, name in enumerate(opcua.variables):
         names.check_pattern(f"{opcua.at}.variables[{position}]", name)

@@ -8,8 +8,9 @@ from typing import Annotated, ClassVar
 import msgspec
 from msgspec import Meta
 
+from eap.ams.spec import Role
 from eap.config.structs import Section
-from eap.config.users import AccountSection, Role
+from eap.config.users import AccountSection
 
 
 class ChannelSecurity(StrEnum):

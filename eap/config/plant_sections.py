@@ -9,6 +9,7 @@ from eap.config.mqtt_sections import MqttSection
 from eap.config.opcua_sections import OpcUaSection
 from eap.config.record_sections import RecordSection
 from eap.config.structs import Defaults, PlantAccess, Section, StationSection, TypeSection
+from eap.config.users import PlantUserSection
 from eap.config.web_sections import MetricsSection, WebSection
 
 
@@ -34,6 +35,7 @@ class PlantFile(Section, frozen=True, kw_only=True):
     stations: tuple[StationSection, ...]
     defaults: Defaults = Defaults()
     access: PlantAccess = PlantAccess()
+    users: tuple[PlantUserSection, ...] = ()
     types: dict[str, TypeSection] | tuple[str | dict[str, TypeSection], ...] = msgspec.field(
         default_factory=dict
     )

@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, TypeAlias
 import msgspec
 from msgspec import Meta
 
+from eap.ams.spec import Role
 from eap.ids import NetId
 from eap.od.slave_config import RevisionRule, StateTimeouts, Watchdogs
 from eap.pd.spec import (
@@ -460,13 +461,14 @@ class AccessSection(Section, frozen=True):
     """Former name of *transports*, which older plant files use."""
     to: tuple[str, ...] = ()
     objects: tuple[str, ...] = ()
+    roles: tuple[Role, ...] = ()
 
 
 class UserSection(Section, frozen=True):
-    """User that may add routes from other hosts."""
+    """User that may add routes from other hosts; without a file one of the plant's users."""
 
     name: str
-    password_file: str
+    password_file: str = ""
 
 
 class StationSection(Section, frozen=True):
@@ -516,3 +518,5 @@ class PlantAccess(Section, frozen=True):
     """Rules for the access to all stations; each has rules of its own beside them."""
 
     audit: AuditMode = AuditMode.OPTIONAL
+    operators: tuple[str, ...] = ()
+    """Variables that operators set by the control socket."""

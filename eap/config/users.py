@@ -1,24 +1,15 @@
-"""Users of the page and of bridges, with their roles and passwords."""
+"""Users of a plant: their roles, and how programs recognize them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from enum import StrEnum
 
+import msgspec
+
+from eap.ams.spec import Role
 from eap.config.finding import FindingReport
 from eap.config.passwords import FORM, PasswordHash
 from eap.config.structs import Section
-
-
-class Role(StrEnum):
-    """Rights of a user, each with those of the ones before."""
-
-    VIEWER = "viewer"
-    """Sees everything."""
-    OPERATOR = "operator"
-    """Sets the variables that the plant file lets operators set."""
-    ENGINEER = "engineer"
-    """Sets every variable of the application."""
 
 
 class AccountSection(Section, frozen=True, kw_only=True):
@@ -29,11 +20,32 @@ class AccountSection(Section, frozen=True, kw_only=True):
     password: str = ""
 
 
+class PlantUserSection(AccountSection, frozen=True, kw_only=True):
+    """User of the whole plant.
+
+    *unix* are users of the operating system and *groups* its groups, for the control socket;
+    *networks* are IPv4 networks and MAC addresses whose hosts have the role in access rules.
+    """
+
+    unix: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
+    networks: tuple[str, ...] = msgspec.field(name="from", default=())
+
+
 def check_users(
-    users: Iterable[AccountSection], report: FindingReport, *, needs_passwords: bool = True
+    users: Iterable[AccountSection],
+    report: FindingReport,
+    *,
+    needs_passwords: bool = True,
+    shared: Iterable[AccountSection] = (),
 ) -> None:
-    """Report users whose names or passwords are invalid, and those that are there twice."""
+    """Report users whose names or passwords are invalid, and those that are there twice.
+
+    *shared* are the users of the plant: a server that has them reports nothing of its own.
+    """
     names: set[str] = set()
+    if users is shared:
+        return
     for user in users:
         if not user.name.strip() or not user.name.isprintable() or ":" in user.name:
             report.add(f"{user.at}.name", f"user {user.name!r}", "a name without colons")

@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeVar
 
 from msgspec.structs import replace
 
+from eap.ams.spec import Role
 from eap.codec import datatypes
 from eap.config.brokers import check_file
 from eap.config.finding import FindingReport, PlantFinding, one_of
@@ -17,7 +18,7 @@ from eap.config.index import Index
 from eap.config.pictures import read_picture
 from eap.config.selection import VariableNames, match_names, reason_not_settable
 from eap.config.structs import StationSection
-from eap.config.users import Role, check_users
+from eap.config.users import check_users
 from eap.config.web_sections import (
     BindSection,
     BusPanel,
@@ -177,14 +178,14 @@ def check_web(index: Index, report: FindingReport, folder: Path) -> None:
     """Report every invalid key of ``web`` and ``metrics``; files are in *folder*."""
     web, metrics = index.plant.web, index.plant.metrics
     if metrics is not None:
-        _check_server(metrics, report, folder)
+        _check_server(metrics, index, report, folder)
         if web is not None and web.listen == metrics.listen:
             message = f"listen: {metrics.listen} is the address of the page"
             expected = "another port, or no such key: the page gives metrics, too"
             report.add(f"{metrics.at}.listen", message, expected)
     if web is None:
         return
-    _check_server(web, report, folder)
+    _check_server(web, index, report, folder)
     names: dict[str, WebPage] = {}
     for page in web.pages:
         if not page.name.strip():
@@ -213,10 +214,13 @@ def warn_of_pictures(index: Index, report: FindingReport, folder: Path) -> list[
     return found
 
 
-def _check_server(section: ServerSection, report: FindingReport, folder: Path) -> None:
+def _check_server(
+    section: ServerSection, index: Index, report: FindingReport, folder: Path
+) -> None:
     """Report every invalid key that all servers have."""
     _check_listen(section, report)
-    check_users(section.users, report, needs_passwords=section.proxy is None)
+    shared = index.plant.users
+    check_users(section.users, report, needs_passwords=section.proxy is None, shared=shared)
     _check_proxy(section, report)
     for position, name in enumerate(section.hosts):
         try:

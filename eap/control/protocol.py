@@ -13,6 +13,7 @@ from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 
+from eap.ams.spec import Role
 from eap.codec.datatypes import Plain
 from eap.errors import ControlError, EnvironmentalError
 from eap.ids import decode_value, encode_value
@@ -119,12 +120,14 @@ class WriteOrigin(Parameters, frozen=True):
         host: Address of the user's program; of MQTT the topic.
         comment: The user's reason.
         transport: Transport of the program, as access rules name it.
+        role: Role of the user, which access rules name, too; None for one without login.
     """
 
     user: str
     host: str
     comment: str = ""
     transport: Literal["web", "mqtt", "opcua", "s7", "modbus"] = "web"
+    role: Role | None = None
 
 
 class WriteParameters(Parameters, frozen=True):

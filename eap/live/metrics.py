@@ -167,6 +167,15 @@ _PROCESS = (
         *("bus_requests", "dropped"),
     ),
 )
+_LOGINS = (
+    Family(
+        "eap_refused_logins",
+        "counter",
+        "Logins that servers refused.",
+        _key("counts"),
+        "why",
+    ),
+)
 _BRIDGE = (
     Family(
         "eap_bridge_up",
@@ -334,7 +343,7 @@ _OWN = (
     _gauge("eap_metrics_left_out", "Series beyond the limit of one answer.", "left_out"),
 )
 FAMILIES: Final = (
-    *_APPLIANCE, *_PROCESS, *_BRIDGE, *_LISTENER, *_STATION, *_PORT, *_FRAME, *_SENT_PD,
+    *_APPLIANCE, *_LOGINS, *_PROCESS, *_BRIDGE, *_LISTENER, *_STATION, *_PORT, *_FRAME, *_SENT_PD,
     *_RECEIVED_PD, *_BUS, *_SLAVE, *_OWN,
 )  # fmt: skip
 
@@ -443,6 +452,8 @@ def _appliance_rows(
         if finding.plant == appliance.plant:
             counts[str(finding.severity)] += 1
     yield _APPLIANCE, labels, {"findings": counts, "audit": appliance.audit}
+    for transport, logins in appliance.logins.items():
+        yield _LOGINS, (*labels, "transport", transport), {"counts": logins}
     processes = dict(appliance.processes)
     segments = processes.pop("segments", {})
     processes |= {f"segment {name}": process for name, process in segments.items()}

@@ -23,6 +23,7 @@ class ApplianceStatus(msgspec.Struct, frozen=True):
     release: str = ""
     host: str = ""
     hosts: list[dict[str, Any]] = []
+    logins: dict[str, dict[str, int]] = {}
 
 
 class SilentAppliance(msgspec.Struct, frozen=True):

@@ -12,6 +12,7 @@ import logging
 import os
 import pwd
 import shutil
+import socket
 import stat
 import struct
 from collections.abc import Sequence
@@ -163,6 +164,7 @@ class ApplianceFolder(Closeable):
         self.path = path
         self._lock_fd = lock_fd
         self._folder_fd = -1
+        self._is_shared = False
 
     @classmethod
     def claim(cls, name: str) -> Self:
@@ -189,6 +191,7 @@ class ApplianceFolder(Closeable):
             )
         try:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            path.chmod(0o700)  # an appliance that was killed may have shared it
             lock_fd = _lock(path)
         except OSError as exc:
             raise EnvironmentalError(
@@ -205,6 +208,21 @@ class ApplianceFolder(Closeable):
         folder._empty()
         folder._keep_from_ageing()
         return folder
+
+    def share(self) -> None:
+        """Let other users of the host find the appliance and reach its control socket.
+
+        The umask of this process and its children closes all other files in the folder to them.
+        """
+        self._is_shared = True
+        os.umask(0o077)
+        self.path.chmod(0o711)
+        if not self.path.parent.stat().st_mode & 0o011:
+            logger.warning(
+                "users of the plant file cannot reach the control socket: other users may not enter"
+                " %s",
+                self.path.parent,
+            )
 
     @property
     def control_socket(self) -> Path:
@@ -237,6 +255,8 @@ class ApplianceFolder(Closeable):
         """Replace ``appliance.json`` in one step."""
         temporary = self.path / "appliance.json.new"
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(info)))
+        if self._is_shared:
+            temporary.chmod(0o644)
         temporary.replace(self.path / "appliance.json")
 
     def read_info(self) -> ApplianceInfo:
@@ -247,6 +267,8 @@ class ApplianceFolder(Closeable):
         """Return whether a supervisor holds the lock; the check never disturbs a start."""
         try:
             fd = os.open(self.path / "lock", os.O_RDWR | os.O_CLOEXEC)
+        except PermissionError:
+            return self._answers()
         except OSError:
             return False
         try:
@@ -256,6 +278,12 @@ class ApplianceFolder(Closeable):
         finally:
             os.close(fd)
         return bool(_FLOCK.unpack(answer)[0] != fcntl.F_UNLCK)
+
+    def _answers(self) -> bool:
+        """Return whether the control socket of another user's appliance can be connected."""
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            probe.setblocking(False)
+            return probe.connect_ex(str(self.control_socket)) == 0
 
     def close(self) -> None:
         """Remove the folder and let go of the lock."""

@@ -15,6 +15,7 @@ import msgspec
 from eap.ams.spec import DirectoryStation, RoutingSpec
 from eap.config.plant_sections import HostSection
 from eap.config.record_sections import RecordSection
+from eap.config.users import PlantUserSection
 from eap.config.web_sections import MetricsSection, WebSection
 from eap.ids import decode_value, encode_value
 from eap.pd.device import DeviceState
@@ -244,6 +245,10 @@ class Handover(InheritedRecord, frozen=True):
     """Host of the plant that this computer is; empty without ``hosts``."""
     hosts: tuple[HostSection, ...] = ()
     """All hosts of the plant."""
+    users: tuple[PlantUserSection, ...] = ()
+    """Users of the plant; without any, each client of the control socket may do everything."""
+    operators: tuple[str, ...] = ()
+    """Patterns of the variables that operators set by the control socket."""
 
     def port(self, name: PortName) -> PortSpec:
         """Return the specification of one port."""

@@ -114,7 +114,7 @@ class AmsUdpSocket:
         self._discovery = AmsDiscovery(
             self._sock,
             routers,
-            RouteAdmin([network.routes[name] for name in names]),
+            RouteAdmin([network.routes[name] for name in names], network.route_logins),
             self._requests,
             network.drop_counter(names),
         )

@@ -18,6 +18,7 @@ from eap.services.routing.station_routes import StationRoutes
 from eap.services.socket_table import SocketTable
 from eap.services.transports.accepting import Listeners
 from eap.services.transports.link_watch import LinkWatch
+from eap.services.transports.route_logins import RouteLogins
 
 
 class ServedTransport(Protocol):
@@ -55,6 +56,7 @@ class Network:
         counters: Of dropped frames and closed connections.
         listeners: Of this process.
         engine: Link to the engine, for connections that belong there.
+        route_logins: Of requests for routes.
 
     Attributes:
         links: Watches the interfaces.
@@ -71,6 +73,7 @@ class Network:
         counters: DropCounters,
         listeners: Listeners,
         engine: socket.socket,
+        route_logins: RouteLogins,
     ) -> None:
         self.table = table
         self.routers = routers
@@ -79,6 +82,7 @@ class Network:
         self.counters = counters
         self.listeners = listeners
         self.engine = engine
+        self.route_logins = route_logins
         self.links = LinkWatch()
         self.batch = ReceiveBatch()
         self.from_ns = monotonic_ns()

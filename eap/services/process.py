@@ -53,7 +53,9 @@ from eap.services.control.control_server import ControlServer
 from eap.services.control.device_methods import DeviceMethods
 from eap.services.control.field_methods import FieldMethods
 from eap.services.control.log_methods import LogMethods
+from eap.services.control.login_log import LoginLog
 from eap.services.control.methods import Methods
+from eap.services.control.peer_roles import PeerRoles
 from eap.services.control.route_methods import AmsMethods, RouteMethods, RoutingMethods
 from eap.services.control.status import (
     ProcessMeter,
@@ -90,6 +92,7 @@ from eap.services.sockets import Transports
 from eap.services.supervisor_link import SupervisorLink
 from eap.services.tasks import keep_serving
 from eap.services.transports.accepting import Listeners
+from eap.services.transports.route_logins import RouteLogins
 from eap.services.transports.station_brokers import StationBrokers
 
 if TYPE_CHECKING:
@@ -283,6 +286,8 @@ class Services:
         self._startup.step("opening gateways and sockets")
         audit = self._audit(devices.routers)
         buses = self._bus_table(link, supervisor, devices, audit)
+        logins = LoginLog(audit)
+        route_logins = RouteLogins(self._handover.users)
         network = Network(
             sockets,
             devices.routers,
@@ -291,6 +296,7 @@ class Services:
             self._counters,
             self._listeners,
             self._link,
+            route_logins,
         )
         transports = Transports(network)
         sockets.on_change.append(transports.follow)
@@ -301,13 +307,17 @@ class Services:
             {each.name: each.net_id for each in self._handover.directory},
             devices.routers,
         )
-        methods = self._methods(images, buses, devices, audit, sockets, hosts)
+        methods = self._methods(images, buses, devices, audit, sockets, hosts, logins)
         remote = RemoteControl(methods.call, devices.routers, record=audit.write_request)
         for name, router in devices.routers.items():
             router.add_service(router.net_id, ControlAds(name, remote))
         reachable = Buses(devices.specs, buses.clients, buses.segments)
         server = ControlServer(
-            methods, reachable, audit.write_request, announce=audit.begin_request
+            methods,
+            reachable,
+            audit.write_request,
+            announce=audit.begin_request,
+            roles=PeerRoles(self._handover.users, self._handover.operators),
         )
         watch = self._subscriber_watch(images, sockets)
         on_sockets: list[Callable[[], Awaitable[None]]] = [
@@ -315,6 +325,7 @@ class Services:
             self._listeners.serve,
             *(each.serve for each in brokers),
             watch.run,
+            partial(route_logins.logins.report, logins.note_routes),
         ]
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(keep_serving(serve)) for serve in on_sockets]
@@ -402,6 +413,7 @@ class Services:
         audit: Audit,
         sockets: SocketTable,
         hosts: HostWatch,
+        logins: LoginLog,
     ) -> Methods:
         meter = ProcessMeter()
         engine = self._resources.enter_context(
@@ -433,10 +445,12 @@ class Services:
             )
             return document | {
                 "audit": audit.report(),
+                "logins": logins.report(),
                 "release": RELEASE,
                 **({"host": hosts.own, "hosts": hosts.report()} if hosts.own else {}),
                 "findings": [
                     *hosts.findings(),
+                    *logins.findings(),
                     *route_findings(devices.routers.values()),
                     *interruption_findings(devices.routers.values(), time()),
                     *(row for each in devices.by_station.values() for row in each.findings()),
@@ -453,7 +467,8 @@ class Services:
             stop=lambda: os.kill(self._handover.supervisor, signal.SIGTERM),
             deny_write=lambda station, origin: denial_of_write(devices.routers[station], origin),
             more=self._more_methods(devices, sockets)
-            | GatewayMethods(sockets, buses.gateways).table(),
+            | GatewayMethods(sockets, buses.gateways).table()
+            | logins.table(),
         )
 
     def _more_methods(

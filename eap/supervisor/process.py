@@ -128,7 +128,12 @@ def _run(
     adopt_plant_file(info.plant, stations, first_state)
     if info.plant_file:
         _log_stored_differences(info.plant, stations)
+    has_other_users = any(user.unix or user.groups for user in plant.users)
+    if has_other_users:
+        folder.share()
     with SharedSockets(folder.control_socket) as sockets:
+        if has_other_users:
+            folder.control_socket.chmod(0o666)
         supervisor = Supervisor(
             info, plant, folder, sockets, options=options, first_state=first_state
         )
@@ -204,6 +209,8 @@ class Supervisor:
             audit_required=plant.audit_required,
             host=info.host,
             hosts=plant.hosts,
+            users=plant.users,
+            operators=plant.operators,
         )
         self._extras |= optional_processes(plant, folder, self._bytecode)
         self._sockets = sockets

@@ -298,7 +298,8 @@ class Api:
         if why := self._rules.reason_refused(user, name, body["value"], comment):
             return refusal(422, why)
         station, _, variable = name.partition("/")
-        origin = WriteOrigin(user.name, self._guard.host_of(request), comment)
+        host, role = self._guard.host_of(request), user.role_in_rules
+        origin = WriteOrigin(user.name, host, comment, role=role)
         try:
             await self._feed.write(station, variable, body["value"], origin)
         except (ControlError, BusError) as exc:

@@ -28,8 +28,10 @@ from aiohttp import web
 
 from eap.config.web import default_role
 from eap.config.web_sections import ServerSection
-from eap.live.logins import LoginFailure, Logins, Principal
+from eap.control.logins import NOTE_LOGINS
+from eap.live.view import LiveView
 from eap.net.limits import RateLimiter
+from eap.runtime.logins import LoginFailure, LoginRefusals, Logins, Principal
 from eap.web.sessions import SESSION_S, Sessions
 
 Handler: TypeAlias = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -136,6 +138,15 @@ class Guard:
             if self.is_secure:
                 answer.headers["Strict-Transport-Security"] = "max-age=31536000"
         return answer
+
+    async def report_logins(self, view: LiveView) -> None:
+        """Report refused logins to the appliances until cancelled."""
+
+        async def send(refused: list[LoginRefusals]) -> None:
+            for client in view.clients().values():
+                await client.call(NOTE_LOGINS, transport=self._key, refused=tuple(refused))
+
+        await self._logins.report(send)
 
     def host_of(self, request: web.Request) -> str:
         """Return the address of the client, also behind the proxy."""

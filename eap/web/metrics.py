@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from time import monotonic
 
 from aiohttp import web
@@ -61,7 +61,16 @@ class MetricsServer:
         """Return the application."""
         app = web.Application(middlewares=[self._guard.check], client_max_size=MAX_BODY)
         app.router.add_get(PATH, MetricsEndpoint(self._take).answer)
+        app.cleanup_ctx.append(self._run)
         return app
+
+    async def _run(self, app: web.Application) -> AsyncIterator[None]:
+        """Report refused logins while the application runs."""
+        del app
+        async with asyncio.TaskGroup() as group:
+            task = group.create_task(self._guard.report_logins(self._view))
+            yield
+            task.cancel()
 
     async def _take(self) -> LiveReport | None:
         async with self._lock:

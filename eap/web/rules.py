@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from eap.config.users import Role
+from eap.ams.spec import Role
 from eap.config.web_sections import CommentRule, SetPanel, WebPage
-from eap.live.logins import Principal
+from eap.runtime.logins import Principal
 
 _MAX_SHOWN = 60
 """Characters of a value in a message."""

@@ -62,6 +62,7 @@ class PageServer:
 
     def __init__(self, section: WebSection, view: LiveView, key: bytes) -> None:
         self._section = section
+        self._view = view
         users = {user.name: user for user in section.users}
         self.guard = Guard(section, Sessions(key, users))
         self.feed = PlantFeed(view, on_status=self._status_changed)
@@ -93,6 +94,7 @@ class PageServer:
         del app
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(self.feed.run()), group.create_task(self.topics.run())]
+            tasks.append(group.create_task(self.guard.report_logins(self._view)))
             yield
             await self.sockets.close_all()
             for task in tasks:

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import msgspec
 
 from eap.config.users import AccountSection
-from eap.live.logins import Principal
+from eap.runtime.logins import Principal
 
 KEY_BYTES = 32
 """Length of the secret that signs sessions."""

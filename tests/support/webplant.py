@@ -11,8 +11,9 @@ from typing import Any
 
 from aiohttp.test_utils import TestClient, TestServer
 
+from eap.ams.spec import Role
 from eap.config.passwords import PasswordHash
-from eap.config.users import AccountSection, Role
+from eap.config.users import AccountSection
 from eap.config.web_sections import WebPage, WebSection
 from eap.control.protocol import ErrorCode, ValuesEvent
 from eap.errors import ControlError

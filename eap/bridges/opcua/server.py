@@ -15,6 +15,7 @@ from typing import Any
 from asyncua import Server, ua
 from asyncua.server.event_generator import EventGenerator
 
+from eap.ams.spec import Role
 from eap.bridges.bridge import Bridge
 from eap.bridges.feed import Sample
 from eap.bridges.opcua.address_space import PlantAddressSpace, taken_value
@@ -31,14 +32,14 @@ from eap.codec.ams import AmsCommand
 from eap.config.opcua import channel_securities, role_of_anonymous
 from eap.config.opcua_sections import ChannelSecurity, ClientTrust, OpcUaSection
 from eap.config.selection import match_names
-from eap.config.users import Role
 from eap.config.web import Listen, parse_listen
 from eap.control.device import REQUEST_STATE
+from eap.control.logins import NOTE_LOGINS
 from eap.control.protocol import ErrorCode, WriteOrigin
 from eap.control.routes import AMS_ASK
 from eap.errors import ControlError, EapError, EnvironmentalError
-from eap.live.logins import Logins, Principal
 from eap.release import RELEASE
+from eap.runtime.logins import LoginRefusals, Logins, Principal
 from eap.runtime.store import plant_folder
 
 STATUS_S = 1.0
@@ -155,6 +156,7 @@ class PlantOpcUa:
                 group.create_task(self._feed.run())
                 group.create_task(self._follow_status())
                 group.create_task(self._follow_plant())
+                group.create_task(self._logins.report(self._note_logins))
                 try:
                     async with asyncio.timeout(_FIRST_PLAN_S):
                         await self._first_plan.wait()
@@ -165,6 +167,9 @@ class PlantOpcUa:
         finally:
             if server.bserver is not None:
                 await server.stop()
+
+    async def _note_logins(self, refused: list[LoginRefusals]) -> None:
+        await self._bridge.call(NOTE_LOGINS, transport="opcua", refused=tuple(refused))
 
     def anonymous(self, host: str) -> Principal | None:
         """Return the user of clients without login, None if they have to log in."""
@@ -203,7 +208,12 @@ class PlantOpcUa:
             return ua.StatusCode(ua.StatusCodes.BadOutOfRange)
         try:
             await self._bridge.write(
-                node.node_id, plain, transport="opcua", host=client.host, user=client.user.name
+                node.node_id,
+                plain,
+                transport="opcua",
+                host=client.host,
+                user=client.user.name,
+                role=client.user.role_in_rules,
             )
         except EapError as exc:
             logger.info("%s by %s@%s: %s", node.node_id, client.user.name, client.host, exc)
@@ -264,14 +274,14 @@ class PlantOpcUa:
         return ua.StatusCodes.Good
 
     async def _request_state(self, station: str, state: str, client: Client) -> None:
-        origin = WriteOrigin(client.user.name, client.host, transport="opcua")
+        origin = _origin_of(client)
         answer = await self._bridge.call(REQUEST_STATE, target=station, state=state, origin=origin)
         if answer.error is not None:
             raise ControlError(answer.error.text, code=ErrorCode.REFUSED)
         await self._take_status((await self._bridge.request("status"))["stations"])
 
     async def _rescan(self, bus: str, client: Client) -> None:
-        origin = WriteOrigin(client.user.name, client.host, transport="opcua")
+        origin = _origin_of(client)
         offset = SdoOffset(1, index=_DETECT_MODULES).encode()
         head = AdsRange(IndexGroup.SDO, int.from_bytes(offset, "little"), len(_SCAN))
         body = head.encode() + _SCAN
@@ -440,6 +450,11 @@ class PlantOpcUa:
         ):
             value = ua.DataValue(variant, SourceTimestamp=datetime.now(UTC))
             await self._server.write_attribute_value(ua.NodeId(number), value)
+
+
+def _origin_of(client: Client) -> WriteOrigin:
+    user = client.user
+    return WriteOrigin(user.name, client.host, transport="opcua", role=user.role_in_rules)
 
 
 def _code_of(error: EapError) -> ua.StatusCodes:

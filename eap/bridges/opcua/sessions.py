@@ -29,7 +29,7 @@ from asyncua.server.uaprocessor import UaProcessor
 from asyncua.ua.ua_binary import struct_from_binary, uatcp_to_binary
 
 from eap.bridges.opcua.certificates import TrustStore, UntrustedError
-from eap.live.logins import Principal
+from eap.runtime.logins import Principal
 from eap.services.tasks import TaskSet
 
 MAX_CONNECTIONS, MAX_OF_HOST = 256, 128

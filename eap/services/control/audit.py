@@ -278,6 +278,16 @@ class Audit:
         else:
             self._write_limited(peer, station, fields)
 
+    def write_login(self, transport: str, host: str, user: str, count: int, why: str) -> None:
+        """Write *count* refused logins of a user from a host."""
+        client = "", transport, host
+        if not self._allow(client):
+            self._skip(client)
+            return
+        head = {"time": self._time(), "station": "", "transport": transport, "from": host}
+        fields = {"operation": "login", "user": user, "count": count, "allowed": False, "why": why}
+        self._append([head | fields])
+
     def _write_limited(self, peer: str, station: str, fields: dict[str, Any]) -> None:
         client = station, CONTROL, peer
         if self._allow(client):

@@ -4,8 +4,9 @@ Rule 1: a client can only delay itself.  Nothing is queued for it: a subscriptio
 again when its last line has left, and a client that reads nothing for SLOW_READER_S is
 disconnected. A client's pending bus requests are cancelled when it leaves, and its conversations
 are ended.
-Rule 2: a process that may open the socket may do everything; its changes are audited all the same,
-with its user, since a process number says nothing later.
+Rule 2: a process that may open the socket may do everything, unless the plant has users: then
+:mod:`eap.services.control.peer_roles` decides.  Changes are audited with the user, since a process
+number says nothing later.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ from eap.runtime.bus_errors import to_record
 from eap.services.control.audit import operation_fields
 from eap.services.control.bus_methods import BusConnection, Buses
 from eap.services.control.methods import Methods, Watch
+from eap.services.control.peer_roles import PeerRoles
 from eap.services.transports.accepting import Listeners, ListeningSocket, TaskConnection, process_of
 
 RecordChange: TypeAlias = Callable[[str, str, dict[str, Any]], None]
@@ -75,12 +77,6 @@ _READ_COMMANDS = frozenset((1, 4, 7))
 _EEPROM_OWNER, _EEPROM_CONTROL, _EEPROM_READ = 0x0500, 0x0502, "0001"
 """Registers, and how the command begins that reads (ETG.1000.4)."""
 _MAX_TEXT = 200
-
-
-def peer_of(connection: socket.socket) -> str:
-    """Return user and process at the other end of a Unix socket."""
-    pid, uid = process_of(connection)
-    return f"uid {uid}, pid {pid}"
 
 
 def change_of(
@@ -213,8 +209,10 @@ class ControlServer:
         record: RecordChange | None = None,
         *,
         announce: AnnounceChange | None = None,
+        roles: PeerRoles | None = None,
         slow_reader_s: float = SLOW_READER_S,
     ) -> None:
+        self._roles = roles or PeerRoles()
         self._methods = methods
         self._buses = buses
         self._record = record
@@ -249,11 +247,22 @@ class ControlServer:
         )
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
         try:
-            peer = peer_of(sock)
-            record = self._record and partial(self._record, peer)
-            announce = self._announce and partial(self._announce, peer)
+            # The user database may be on the network; few clients need it.
+            peer = self._roles.own_peer(sock) or await asyncio.to_thread(self._roles.identify, sock)
+            if peer is None:
+                self._refuse_peer(sock, writer)
+                return
+            record = self._record and partial(self._record, peer.text)
+            announce = self._announce and partial(self._announce, peer.text)
             client = _Client(
-                self._methods, self._buses, writer, self._slow_reader_s, record, announce
+                self._methods,
+                self._buses,
+                writer,
+                self._slow_reader_s,
+                record,
+                announce,
+                partial(self._roles.reason_denied, peer),
+                peer.user.name,
             )
             connection.subscriptions = client.subscriptions
             await client.run(reader)
@@ -262,6 +271,13 @@ class ControlServer:
         finally:
             # Not close(): it would wait for a client that does not read.
             transport.abort()
+
+    def _refuse_peer(self, sock: socket.socket, writer: asyncio.StreamWriter) -> None:
+        pid, uid = process_of(sock)
+        why = f"user {uid} of this host has no role in the plant file"
+        writer.write(encode_error(None, ControlError(why, code=ErrorCode.REFUSED)))
+        if self._record is not None:
+            self._record(f"uid {uid}, pid {pid}", "", {"operation": "connect", "error": why})
 
 
 class ControlConnection(TaskConnection):
@@ -350,7 +366,11 @@ class _Client:
         slow_reader_s: float,
         record: Callable[[str, dict[str, Any]], None] | None,
         announce: Callable[[str, dict[str, Any]], str] | None,
+        reason_denied: Callable[..., str],
+        user: str,
     ) -> None:
+        self._reason_denied = reason_denied
+        self._user = user
         self._methods = methods
         self._announce = announce
         self._record = record
@@ -397,6 +417,7 @@ class _Client:
         try:
             request = decode_request(line)
             number = request.id
+            self._check_role(request)
             if request.method == "subscribe":
                 await self._subscribe(number, request.params, group)
                 return
@@ -411,12 +432,23 @@ class _Client:
         else:
             await self.send(encode_result(number, result))
 
+    def _check_role(self, request: Request) -> None:
+        """Raise ControlError, after writing it down, if the client's role does not allow it."""
+        change = partial(change_of, request, self._opened)
+        if why := self._reason_denied(request, is_change=lambda: change() is not None):
+            if self._record is not None:
+                station, fields = change() or ("", {"operation": request.method})
+                self._record(station, fields | {"user": self._user, "error": why})
+            raise ControlError(why, code=ErrorCode.REFUSED)
+
     async def _call_audited(self, request: Request) -> Any:
         """Have a change written down when it is known how it came out, before it is answered."""
         change = None if self._record is None else change_of(request, self._opened)
         if change is None or self._record is None:
             return await self._call(request)
         station, fields = change
+        if self._user:
+            fields |= {"user": self._user}
         conversation = None
         if request.method == "bus_ask":
             conversation = self._opened(request.params["conversation"])

@@ -124,7 +124,8 @@ def denial_of_control(router: StationRouter, origin: WriteOrigin) -> str:
 def _denial_of(router: StationRouter, origin: WriteOrigin, operation: Operation) -> str:
     # These clients have no NetID, and their addresses no port that would tell anything.
     endpoint = Endpoint(TransportKind(origin.transport), origin.host)
-    grants = router.access.grants(endpoint, NetId(b""), router.net_id, IO_PORT)
+    role = origin.role
+    grants = router.access.grants(endpoint, NetId(b""), router.net_id, IO_PORT, role)
     decision = grants.decide(operation)
     is_by_role = endpoint.kind in _WITH_ROLES and not decision.is_by_rule
     return "" if decision.is_allowed or is_by_role else decision.why

@@ -11,18 +11,16 @@ A tool that only sends requests needs no such route, because answers return on i
 from __future__ import annotations
 
 import asyncio
-import hmac
 import logging
 import socket
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from ipaddress import IPv4Address
-from pathlib import Path
 from time import monotonic
 from typing import NamedTuple
 
 from eap.ams.access import AddRoute, AuditedOperation, AuditEntry, Decision
 from eap.ams.routes import Origin, RouteTable
-from eap.ams.spec import AccessService, AmsUser, HopSpec, RouteSpec, TransportKind
+from eap.ams.spec import AccessService, HopSpec, RouteSpec, TransportKind
 from eap.codec.ads import AdsError
 from eap.codec.ams import AMS_TCP_PORT, SYSTEM_PORT, AmsHeader
 from eap.codec.amsdiscovery import (
@@ -40,7 +38,6 @@ from eap.codec.amsdiscovery import (
 )
 from eap.errors import CodecError, ControlError, EnvironmentalError
 from eap.ids import STATION_OCTETS, Endpoint, NetId, parse_host
-from eap.net.host import read_password
 from eap.net.limits import Rate, SourceRateLimiter, SourceRates
 from eap.release import RELEASE
 from eap.runtime.drop_counters import DropReason
@@ -48,6 +45,7 @@ from eap.services.limited_log import caused_by
 from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.tasks import TaskSet
+from eap.services.transports.route_logins import RouteLogins
 
 # Requests beyond these rates get no answer, so that guessing passwords takes time.
 RATES = SourceRates(
@@ -76,13 +74,19 @@ class RouteAdmin:
 
     Args:
         stations: Routes of each station there; all of them get a route.
+        logins: Logins of the process.
         clock: In seconds.
     """
 
     def __init__(
-        self, stations: Sequence[StationRoutes], *, clock: Callable[[], float] = monotonic
+        self,
+        stations: Sequence[StationRoutes],
+        logins: RouteLogins,
+        *,
+        clock: Callable[[], float] = monotonic,
     ) -> None:
         self._stations = stations
+        self._logins = logins
         self._clock = clock
         self._limiter = SourceRateLimiter(RATES, MAX_SOURCES, clock())
 
@@ -106,13 +110,14 @@ class RouteAdmin:
             return None
         name = _text(request, Tag.ROUTE_NAME)[:_SHOWN]
         results = []
-        for station in self._stations:
+        denials = await self._denials(request, sender, is_this_host=is_this_host)
+        for station, denial in zip(self._stations, denials, strict=True):
             wanted = _audited(station.router.net_id, request, sender, AdsError.NONE, "")
             # Recorded before the change, because an audit that is required must not miss it.
             if why := station.router.why_not_recorded(wanted):
                 result = AdsError.ACCESS
             else:
-                result, why = await _decide(station, request, sender, is_this_host=is_this_host)
+                result, why = await _decide(station, request, sender, denial)
             level = logging.INFO if result == AdsError.NONE else logging.WARNING
             cause = caused_by((station.router.net_id, name, sender, why), sender)
             logger.log(level, "route %r requested by %s: %s", name, sender, why, extra=cause)
@@ -122,6 +127,19 @@ class RouteAdmin:
             # All stations decide, although only one answer is sent: the first error of them.
             results.append(result)
         return next((each for each in results if each != AdsError.NONE), AdsError.NONE)
+
+    async def _denials(self, request: Discovery, sender: str, *, is_this_host: bool) -> list[str]:
+        """Return why the sender may not add a route to each station; empty where it may."""
+        with_users = [each.spec.users for each in self._stations if each.spec.users]
+        refused: Iterator[str] = iter(())
+        if with_users:
+            user = _text(request, Tag.USER)
+            password = (request.find(Tag.PASSWORD) or b"").partition(b"\0")[0]
+            refused = iter(await self._logins.refusals(with_users, user, password, sender))
+        closed = (
+            "" if is_this_host else "the station has no users, so only this host may add routes"
+        )
+        return [next(refused) if each.spec.users else closed for each in self._stations]
 
 
 def _audited(
@@ -142,12 +160,12 @@ def _audited(
 
 
 async def _decide(
-    station: StationRoutes, request: Discovery, sender: str, *, is_this_host: bool
+    station: StationRoutes, request: Discovery, sender: str, denial: str
 ) -> tuple[AdsError, str]:
     """Return the result for the sender, and a text for the log."""
-    if refused := _why_denied(station.spec.users, request, is_this_host=is_this_host):
+    if denial:
         # Tools expect 0x704 after a wrong password.
-        return AdsError.ACCESS, f"refused: {refused}"
+        return AdsError.ACCESS, f"refused: {denial}"
     try:
         wanted = _read(request, sender)
         configured = _configured(station.router.table, wanted.net_id)
@@ -163,38 +181,6 @@ async def _decide(
 
 def _text(request: Discovery, tag: int) -> str:
     return decode_text(request.find(tag) or b"")
-
-
-def _why_denied(users: Sequence[AmsUser], request: Discovery, *, is_this_host: bool) -> str:
-    """Return why the sender may not add a route, empty if it may."""
-    if users:
-        user = _text(request, Tag.USER)[:_SHOWN]
-        return "" if _is_known(users, request) else f"user {user!r} or the password is wrong"
-    return "" if is_this_host else "the station has no users, so only this host may add routes"
-
-
-def _is_known(users: Sequence[AmsUser], request: Discovery) -> bool:
-    name = _text(request, Tag.USER)
-    given = (request.find(Tag.PASSWORD) or b"").partition(b"\0")[0]
-    is_known = False
-    for user in users:  # all of them: the time must not reveal whether a user exists
-        password = _password(user)
-        is_right = password is not None and hmac.compare_digest(password, given)
-        is_known |= is_right and hmac.compare_digest(user.name.encode(), name.encode())
-    return is_known
-
-
-def _password(user: AmsUser) -> bytes | None:
-    """Return the password of *user*; log a warning and return None without one."""
-    try:
-        password = read_password(Path(user.password_file))
-        reason = "" if password else f"{user.password_file}: its first line is empty"
-    except EnvironmentalError as exc:
-        password, reason = b"", str(exc)
-    if reason:
-        cause = caused_by((user.name, reason), f"user {user.name}")
-        logger.warning("password of user %s: %s", user.name, reason, extra=cause)
-    return password or None
 
 
 def _read(request: Discovery, sender: str) -> _RouteRequest:

@@ -15,7 +15,7 @@ from eap.ads.request import (
     WriteControl,
 )
 from eap.ams.access import AccessList, Grants, address_of, host_of, objects_of, service_of
-from eap.ams.spec import AccessRule, AccessTarget, ObjectRange
+from eap.ams.spec import AccessRule, AccessTarget, ObjectRange, Role
 from eap.ams.spec import AccessService as Service
 from eap.codec.ads import IndexGroup
 from eap.codec.adsnotification import AddNotification
@@ -228,3 +228,21 @@ def test_senders_on_ethernet_have_mac_addresses(transport, connection, fits) -> 
         .decide(WRITE)
         .is_allowed
     )
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "role", "fits"),
+    [
+        (LAPTOP, None, True),
+        (Endpoint("ams-tcp", "10.0.0.6:49152"), None, False),
+        (Endpoint("ethernet:eap1", "02:00:00:00:00:0a"), None, True),
+        (Endpoint("ethernet:eap1", "02:00:00:00:00:0b"), None, False),
+        (Endpoint("mqtt:line", "5.1.1.1.1.1"), None, False),
+        (Endpoint("web", "10.0.0.6"), Role.OPERATOR, True),
+        (Endpoint("web", "10.0.0.5"), Role.VIEWER, False),
+    ],
+)
+def test_rule_with_roles_fits_logged_in_users_by_role_and_others_by_address(endpoint, role, fits):
+    rule = AccessRule("r", roles=(Role.OPERATOR,), members=("10.0.0.5/32", "02:00:00:00:00:0a"))
+    found = AccessList([rule]).grants(endpoint, ENGINEER, *SLAVE, role)
+    assert found.decide(WRITE).is_allowed is fits

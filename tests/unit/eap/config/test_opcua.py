@@ -5,11 +5,11 @@ import textwrap
 
 import pytest
 
+from eap.ams.spec import Role
 from eap.config.index import ExpectedBus
 from eap.config.load import PlantResult, load
 from eap.config.opcua import channel_securities, role_of_anonymous
 from eap.config.opcua_sections import ChannelSecurity, OpcUaSection
-from eap.config.users import Role
 from tests.support.webplant import HASH
 
 PLANT = """\

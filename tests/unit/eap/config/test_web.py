@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eap.ams.spec import Role
 from eap.config.index import ExpectedBus
 from eap.config.load import PlantResult, load
 from eap.config.selection import match_names
-from eap.config.users import Role
 from eap.config.web import default_role, parse_listen, window_s
 from eap.config.web_sections import WebSection
 from tests.support.webplant import HASH

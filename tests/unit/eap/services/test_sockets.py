@@ -25,6 +25,7 @@ from eap.services.socket_table import SocketFollower, SocketTable
 from eap.services.sockets import Transports
 from eap.services.supervisor_link import SupervisorLink
 from eap.services.transports.accepting import Listeners
+from eap.services.transports.route_logins import RouteLogins
 from eap.supervisor.sockets import SharedSockets
 from tests.support import aoe
 from tests.support.eventually import eventually
@@ -71,7 +72,14 @@ class Scene:
         resources.callback(self.table.close)
         self.listeners = Listeners()
         network = Network(
-            self.table, self.routers, routes, GatewayTable(), self.counters, self.listeners, ours
+            self.table,
+            self.routers,
+            routes,
+            GatewayTable(),
+            self.counters,
+            self.listeners,
+            ours,
+            RouteLogins(),
         )
         self.transports = Transports(network)
         self.table.on_change.append(self.transports.follow)

@@ -15,7 +15,7 @@ import pytest
 from aiohttp import WSMsgType, WSServerHandshakeError, encode_basic_auth
 from msgspec.structs import replace
 
-from eap.config.users import Role
+from eap.ams.spec import Role
 from eap.config.web_sections import (
     CommentRule,
     PicturePanel,
@@ -28,8 +28,8 @@ from eap.config.web_sections import (
     WebTls,
 )
 from eap.errors import EnvironmentalError
-from eap.live.logins import FREE_FAILURES
 from eap.live.view import LiveView
+from eap.runtime.logins import FREE_FAILURES
 from eap.web import guard, server, sockets
 from eap.web.process import session_key
 from tests.support.webplant import KEY, PASSWORD, USERS, Site, StubPlant, page, site, stub_client

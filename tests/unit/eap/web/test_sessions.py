@@ -2,8 +2,8 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from eap.config.users import Role
-from eap.live.logins import Principal
+from eap.ams.spec import Role
+from eap.runtime.logins import Principal
 from eap.web.sessions import SESSION_S, Sessions
 from tests.support.webplant import USERS
 

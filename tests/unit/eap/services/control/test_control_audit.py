@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import socket
 from typing import Any
 
 import pytest
@@ -11,7 +9,7 @@ import pytest
 from eap.control.bus import BusOpenParameters, MailboxData
 from eap.control.device import ApplyAnswer, StateAnswer, StateError
 from eap.control.protocol import Request
-from eap.services.control.control_server import change_of, error_in_result, peer_of
+from eap.services.control.control_server import change_of, error_in_result
 
 
 def opened(protocol: str = "coe") -> BusOpenParameters:
@@ -20,12 +18,6 @@ def opened(protocol: str = "coe") -> BusOpenParameters:
 
 def told(method: str, protocol: str = "coe", **params: Any) -> tuple[str, dict[str, Any]] | None:
     return change_of(Request(v=1, id=1, method=method, params=params), lambda _: opened(protocol))
-
-
-def test_peer_of_a_unix_socket() -> None:
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        assert peer_of(theirs) == f"uid {os.getuid()}, pid {os.getpid()}"
 
 
 @pytest.mark.parametrize("method", ["hello", "status", "od_read", "bus_describe", "plan"])

@@ -9,16 +9,20 @@ import socket
 
 import pytest
 
+from eap.ams.spec import Role
+from eap.config.users import PlantUserSection
 from eap.control.protocol import MAX_LINE, MAX_SUBSCRIPTIONS
 from eap.errors import ControlError, TornReadError
 from eap.ids import InterfaceUri, NetId
 from eap.net.limits import Activity, CloseReason, ListenerLimits
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.pd.spec import PortKind, PortSpec, StationSpec
+from eap.runtime.logins import Principal
 from eap.services.control import control_server
 from eap.services.control.bus_methods import Buses
 from eap.services.control.control_server import ControlConnection, ControlServer
 from eap.services.control.methods import Methods, Watch
+from eap.services.control.peer_roles import ControlPeer, PeerRoles
 from eap.services.engine_link import EngineLink
 from eap.services.transports.accepting import Listeners
 from tests.support.eventually import eventually, settle
@@ -415,3 +419,35 @@ def test_errors_of_a_bus_keep_kind_and_detail(methods):
         engine.close()
 
     asyncio.run(conversation())
+
+
+def test_role_of_a_client_limits_it_and_its_name_is_audited(methods, monkeypatch):
+    lines = []
+
+    def record(peer, station, fields):
+        lines.append((station, fields["operation"], fields.get("user"), fields["error"]))
+
+    anna = PlantUserSection(name="anna", role=Role.OPERATOR, unix=("anna",))
+    roles = PeerRoles([anna], ["*/setpoint"])
+    server = ControlServer(methods, NO_BUSES, record, roles=roles)
+    peers = [ControlPeer("uid 7, pid 9", Principal("anna", Role.OPERATOR)), None]
+    monkeypatch.setattr(PeerRoles, "own_peer", lambda *_: None)
+    monkeypatch.setattr(PeerRoles, "identify", lambda *_: peers.pop(0))
+
+    async def conversation():
+        async with Talk(server) as talk:
+            assert "result" in await talk.ask("hello")
+            refused = (await talk.ask("stop"))["error"]
+            assert refused == {
+                "code": "refused",
+                "message": "anna is operator, and stop needs engineer",
+            }
+            assert "result" in await talk.ask("hello")
+        async with Talk(server) as talk:
+            assert "has no role" in (await talk.hear())["error"]["message"]
+
+    asyncio.run(conversation())
+    assert lines == [
+        ("", "stop", "anna", "anna is operator, and stop needs engineer"),
+        ("", "connect", None, f"user {os.getuid()} of this host has no role in the plant file"),
+    ]

@@ -9,7 +9,7 @@ import os
 import pytest
 
 from eap.ams.routes import Origin
-from eap.ams.spec import AmsUser, HopSpec, RouteSpec, RoutingSpec, TransportKind
+from eap.ams.spec import AmsUser, HopSpec, Role, RouteSpec, RoutingSpec, TransportKind
 from eap.codec.ads import AdsError
 from eap.codec.amsdiscovery import (
     TEMPORARY,
@@ -18,12 +18,17 @@ from eap.codec.amsdiscovery import (
     Tag,
     decode_discovery,
 )
+from eap.config.passwords import PasswordHash
+from eap.config.users import AccountSection
 from eap.ids import NetId
+from eap.runtime.logins import FREE_FAILURES
 from eap.runtime.store import StationStore
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.ams_discovery import RATES, RouteAdmin
+from eap.services.transports.route_logins import RouteLogins
 from tests.support.routing import station
 from tests.support.vectors import load
+from tests.support.virtualtime import run_virtual
 
 ADD_ROUTE = decode_discovery(next(iter(load("ams_discovery"))).octets)
 OWN = "10.0.0.1.2.1"
@@ -50,7 +55,7 @@ def routes(name="left", **told) -> StationRoutes:
 
 
 def ask(found, question=ADD_ROUTE, sender="10.0.0.5", *, is_this_host=False):
-    route_admin = RouteAdmin([found], clock=lambda: 0.0)
+    route_admin = RouteAdmin([found], RouteLogins(), clock=lambda: 0.0)
     return asyncio.run(route_admin.handle(question, sender, is_this_host=is_this_host))
 
 
@@ -187,7 +192,7 @@ def test_a_route_that_cannot_be_kept_is_not_added(monkeypatch, caplog):
 
 def test_all_stations_of_an_address_get_the_route():
     both = [routes(), routes("right")]
-    taking = RouteAdmin(both).handle(ADD_ROUTE, "127.0.0.1", is_this_host=True)
+    taking = RouteAdmin(both, RouteLogins()).handle(ADD_ROUTE, "127.0.0.1", is_this_host=True)
     assert asyncio.run(taking) == AdsError.NONE
     assert [each.added for each in both] == [(ADDED,), (ADDED,)]
 
@@ -213,7 +218,7 @@ class Desk:
 
     def __init__(self) -> None:
         self.now = 0.0
-        self.route_admin = RouteAdmin([routes()], clock=lambda: self.now)
+        self.route_admin = RouteAdmin([routes()], RouteLogins(), clock=lambda: self.now)
 
     def ask(self, sender, count=1, *, is_this_host=False):
         takings = [
@@ -258,3 +263,55 @@ def test_route_admin_known_senders_are_limited_together_and_new_ones_are_answere
     ]
     assert answers.count(AdsError.ACCESS) == RATES.known.burst
     assert route_admin.ask("10.0.1.1") == [AdsError.ACCESS]
+
+
+def engineer(**keys) -> AccountSection:
+    fields = {"role": Role.ENGINEER, "password": str(PasswordHash.of("1", bytes(16)))} | keys
+    return AccountSection(name="Administrator", **fields)
+
+
+@pytest.mark.parametrize(
+    ("account", "result"),
+    [
+        (engineer(), AdsError.NONE),
+        (engineer(password=str(PasswordHash.of("2", bytes(16)))), AdsError.ACCESS),
+        (engineer(password=""), AdsError.ACCESS),
+        (engineer(role=Role.OPERATOR), AdsError.ACCESS),
+    ],
+)
+def test_user_without_a_file_is_an_engineer_of_the_plant(account, result):
+    found = routes(users=(AmsUser("Administrator"),))
+    route_admin = RouteAdmin([found], RouteLogins([account]), clock=lambda: 0.0)
+    assert asyncio.run(route_admin.handle(ADD_ROUTE, "10.0.0.5", is_this_host=False)) == result
+
+
+def test_wrong_passwords_lock_the_user_out_at_its_host_and_are_reported(tmp_path, caplog):
+    found, logins = routes(users=(user(tmp_path),)), RouteLogins()
+    entries = []
+    found.router.on_audit.append(entries.append)
+
+    def try_route(request, sender="10.0.0.5"):
+        route_admin = RouteAdmin([found], logins, clock=lambda: 0.0)
+        return asyncio.run(route_admin.handle(request, sender, is_this_host=False))
+
+    for _ in range(FREE_FAILURES):
+        assert try_route(asked(password=b"guessed\0")) == AdsError.ACCESS
+    assert try_route(ADD_ROUTE) == AdsError.ACCESS  # the right one, too late
+    assert try_route(ADD_ROUTE, "10.0.0.6") == AdsError.NONE
+    why = entries[-2].operations[0].decision.why
+    assert why == "refused: locked after wrong passwords: user 'Administrator', for 30 s"
+    refused = []
+
+    async def report():
+        async def send(news):
+            refused.extend(news)
+            raise asyncio.CancelledError
+
+        with pytest.raises(asyncio.CancelledError):
+            await logins.logins.report(send)
+
+    run_virtual(report())
+    assert [(each.user, each.host, str(each.why), each.count) for each in refused] == [
+        ("Administrator", "10.0.0.5", "wrong", FREE_FAILURES),
+        ("Administrator", "10.0.0.5", "locked", 1),
+    ]

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from eap.live.logins import FREE_FAILURES, LoginGuard
+from eap.runtime.logins import FREE_FAILURES, LoginGuard
 
 
 def fail(guard: LoginGuard, number: int, user: str, host: str, now_s: float = 0.0) -> None:

@@ -1,4 +1,4 @@
-"""Logins by password, for the page and for bridges: users, lock-out after wrong passwords."""
+"""Logins by password: users, lock-out after wrong passwords, and the report of refused logins."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ import asyncio
 import logging
 import os
 from collections import OrderedDict
-from collections.abc import Iterable
-from enum import Enum, auto
+from collections.abc import Awaitable, Callable, Iterable
+from enum import StrEnum, auto
 from time import monotonic
 from typing import NamedTuple
 
+import msgspec
+
+from eap.ams.spec import Role
 from eap.config.passwords import MAX_PASSWORD, PasswordHash
-from eap.config.users import AccountSection, Role
+from eap.config.users import AccountSection
+from eap.errors import EapError
 
 RANK = {Role.VIEWER: 0, Role.OPERATOR: 1, Role.ENGINEER: 2}
 
@@ -23,12 +27,17 @@ class Principal(NamedTuple):
     name: str
     role: Role
 
+    @property
+    def role_in_rules(self) -> Role | None:
+        """Role for access rules; None without login."""
+        return self.role if self.name else None
+
     def may_act_as(self, role: Role) -> bool:
         """Return whether this user has the rights of *role*."""
         return RANK[self.role] >= RANK[role]
 
 
-class LoginFailure(Enum):
+class LoginFailure(StrEnum):
     """Reason that a login is refused."""
 
     WRONG = auto()
@@ -102,8 +111,21 @@ class LoginGuard:
 _MAX_HASHING = 8
 """Logins that wait for their password to be hashed."""
 _BUSY_S = 2.0
+_REPORT_S = 1.0
+_SHOWN = 40
+_MAX_REFUSALS = 200
+"""Different refusals that one report has; further ones are counted without user and host."""
 
 logger = logging.getLogger(__name__)
+
+
+class LoginRefusals(msgspec.Struct, frozen=True):
+    """Refused logins of a user from a host since the last report."""
+
+    user: str
+    host: str
+    why: LoginFailure
+    count: int
 
 
 class Logins:
@@ -118,28 +140,66 @@ class Logins:
         self._guard = LoginGuard()
         self._hashing = asyncio.Semaphore(1)
         self._waiting = 0
+        self._refusals: dict[tuple[str, str, LoginFailure], int] = {}
         # One that no password has: an unknown user takes as long as a wrong password.
         self._nobody = PasswordHash(1 << 15, 8, 1, os.urandom(16), bytes(32))
 
     async def verify(self, user: str, password: str, host: str) -> Principal | RefusedLogin:
         """Return the user if the password is right, else the refusal."""
+        return await self.attempt(user, host, lambda: self.match(user, password))
+
+    async def attempt(
+        self, user: str, host: str, match: Callable[[], Awaitable[Principal | None]]
+    ) -> Principal | RefusedLogin:
+        """Return the user that *match* finds; not tried while user or host are locked."""
         now_s = monotonic()
         if locked_s := self._guard.locked_s(user, host, now_s):
-            return RefusedLogin(LoginFailure.LOCKED, locked_s)
+            return self._refuse(user, host, LoginFailure.LOCKED, locked_s)
         if self._waiting >= _MAX_HASHING:
-            return RefusedLogin(LoginFailure.BUSY, _BUSY_S)
-        known = self._users.get(user)
-        stored = PasswordHash.parse(known.password) if known and known.password else self._nobody
+            return self._refuse(user, host, LoginFailure.BUSY, _BUSY_S)
         self._waiting += 1
         try:
-            # One at a time: each takes 32 MB and a tenth of a second of a core.
-            async with self._hashing:
-                is_right = await asyncio.to_thread(stored.matches, password)
+            found = await match()
         finally:
             self._waiting -= 1
-        if known is not None and is_right and len(password.encode()) <= MAX_PASSWORD:
+        if found is not None:
             self._guard.succeed(user, host)
-            return Principal(known.name, known.role)
+            return found
         number = self._guard.fail(user, host, monotonic())
-        logger.warning("login of %r from %s refused (%d wrong passwords)", user[:40], host, number)
-        return RefusedLogin(LoginFailure.WRONG, 0.0)
+        logger.warning(
+            "login of %r from %s refused (%d wrong passwords)", user[:_SHOWN], host, number
+        )
+        return self._refuse(user, host, LoginFailure.WRONG, 0.0)
+
+    async def match(self, user: str, password: str) -> Principal | None:
+        """Return the user with this password, None if there is none; takes a tenth of a second."""
+        known = self._users.get(user)
+        stored = PasswordHash.parse(known.password) if known and known.password else self._nobody
+        # One at a time: each takes 32 MB and a tenth of a second of a core.
+        async with self._hashing:
+            is_right = await asyncio.to_thread(stored.matches, password)
+        if known is None or not is_right or len(password.encode()) > MAX_PASSWORD:
+            return None
+        return Principal(known.name, known.role)
+
+    async def report(self, send: Callable[[list[LoginRefusals]], Awaitable[None]]) -> None:
+        """Send the refused logins once a second, until cancelled; kept while *send* fails."""
+        while True:
+            await asyncio.sleep(_REPORT_S)
+            refused, self._refusals = self._refusals, {}
+            try:
+                if refused:
+                    await send([LoginRefusals(*key, count) for key, count in refused.items()])
+            except EapError:
+                for key, count in refused.items():
+                    self._note(*key, count)
+
+    def _refuse(self, user: str, host: str, why: LoginFailure, wait_s: float) -> RefusedLogin:
+        self._note(user[:_SHOWN], host, why, 1)
+        return RefusedLogin(why, wait_s)
+
+    def _note(self, user: str, host: str, why: LoginFailure, count: int) -> None:
+        key = user, host, why
+        if key not in self._refusals and len(self._refusals) >= _MAX_REFUSALS:
+            key = "", "", why
+        self._refusals[key] = self._refusals.get(key, 0) + count
