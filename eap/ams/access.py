@@ -38,6 +38,7 @@ from eap.ams.error_reply import RoutingError
 from eap.ams.record import Outcome, Record, Trace, describe
 from eap.ams.spec import (
     IP_TRANSPORTS,
+    NAMED_CLIENTS,
     AccessRule,
     AccessService,
     ObjectRange,
@@ -251,15 +252,24 @@ def host_of(endpoint: Endpoint) -> str:
 
 
 class _Senders:
-    """IPv4 networks and MAC addresses of clients."""
+    """IPv4 networks, MAC addresses and transports of clients."""
 
     def __init__(self, texts: Iterable[str]) -> None:
-        parts = [(text, ":" in text or "-" in text) for text in texts]
-        self._networks = tuple(IPv4Network(text) for text, is_mac in parts if not is_mac)
-        self._macs = frozenset(str(MacAddr.parse(text)) for text, is_mac in parts if is_mac)
-        self.is_empty = not parts
+        transports, networks, macs = set(), [], set()
+        for text in texts:
+            if text.startswith(NAMED_CLIENTS):
+                transports.add(text)
+            elif ":" in text or "-" in text:
+                macs.add(str(MacAddr.parse(text)))
+            else:
+                networks.append(IPv4Network(text))
+        self._transports = frozenset(transports)
+        self._networks, self._macs = tuple(networks), frozenset(macs)
+        self.is_empty = not (transports or networks or macs)
 
     def has(self, endpoint: Endpoint, address: IPv4Address | None) -> bool:
+        if endpoint.transport in self._transports:
+            return True
         # Ethernet has no IP address: the MAC address alone identifies the peer.
         if endpoint.kind == TransportKind.ETHERNET:
             return endpoint.connection in self._macs

@@ -53,6 +53,10 @@ IP_TRANSPORTS = frozenset(
 """Kinds of transports whose connections begin with an IPv4 address."""
 
 
+NAMED_CLIENTS = (f"{TransportKind.MQTT}:",)
+"""Prefixes of transports that stand for clients which somebody has authenticated."""
+
+
 class HopSpec(SpecStruct, frozen=True):
     """Next hop of packets.
 
@@ -189,7 +193,7 @@ class AccessRule(SpecStruct, frozen=True):
         services: Kinds of operations.
         objects: Of a dictionary; a rule that has some is about nothing else.
         roles: Of users: a client that has logged in fits by its role, any other one by *members*.
-        members: IPv4 networks and MAC addresses of the users with these roles.
+        members: IPv4 networks, MAC addresses and transports of the users with these roles.
     """
 
     name: str

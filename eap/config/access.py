@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from eap.ams.spec import (
     IP_TRANSPORTS,
+    NAMED_CLIENTS,
     AccessRule,
     AccessService,
     AccessTarget,
@@ -59,7 +60,7 @@ def access_rules(index: Index, station: StationSection, shared: set[str]) -> Ite
             objects=tuple(parse_objects(text) for text in access.objects),
             roles=access.roles,
             members=tuple(
-                parse_sender(text)
+                parse_member(text)
                 for user in index.plant.users
                 if user.role in access.roles
                 for text in user.networks
@@ -100,6 +101,13 @@ def parse_sender(text: str) -> str:
     except ValueError:
         message = f"{text!r} is no IPv4 network and no MAC address"
         raise SectionError("", message, "a network such as 10.0.0.0/24, or an address") from None
+
+
+def parse_member(text: str) -> str:
+    """Return an address of a user as :func:`parse_sender`, or the transport of its clients."""
+    if text.startswith(NAMED_CLIENTS) and not text.endswith(":"):
+        return text
+    return parse_sender(text)
 
 
 def _is_mac(text: str) -> bool:

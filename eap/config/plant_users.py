@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from msgspec.structs import replace
 
-from eap.config.access import parse_sender
+from eap.config.access import parse_member
 from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.opcua_sections import OpcUaSection
@@ -65,12 +65,12 @@ def _places(
     """Yield the valid addresses of a user, after reporting the others."""
     for position, text in enumerate(user.networks):
         try:
-            yield user, parse_sender(text)
+            yield user, parse_member(text)
         except SectionError as exc:
             report.add(f"{user.at}.from[{position}]", f"from: {exc}", exc.expected)
 
 
 def _overlap(one: str, other: str) -> bool:
-    if ":" in one or ":" in other:
+    if ":" in one + other:
         return one == other
     return IPv4Network(one).overlaps(IPv4Network(other))

@@ -23,6 +23,7 @@ from eap.services.routing.remote_routers import RouterRequests
 from eap.services.routing.station_router import StationRouter
 from eap.services.routing.station_routes import StationRoutes
 from eap.services.transports.ams_discovery import AmsDiscovery, RouteAdmin, RouterName
+from eap.services.transports.route_logins import RouteLogins
 
 OWN = NetId.parse("10.0.0.1.1.1")
 _MAX_ANSWER = 64
@@ -67,7 +68,7 @@ async def _answer(data: bytes, users: tuple[AmsUser, ...]) -> None:
     routes = StationRoutes(StationRouter("left", OWN), RoutingSpec(users=users), _Store())
     refused: list[DropReason] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        route_admin = RouteAdmin([routes])
+        route_admin = RouteAdmin([routes], RouteLogins())
         requests = RouterRequests(sock, [OWN])
         if requests.receive(data, "127.0.0.1"):
             raise AssertionError("the answer to a question that was not asked")
