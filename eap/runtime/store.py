@@ -358,7 +358,7 @@ def lean(value: Any) -> Any:
     """
     if isinstance(value, msgspec.Struct):
         tag, defaults = _outline(type(value))
-        fields = {"kind": tag} if tag is not None else {}
+        fields: dict[str, Any] = dict(tag)
         for name, key, default in defaults:
             held = getattr(value, name)
             if held != default:
@@ -370,9 +370,11 @@ def lean(value: Any) -> Any:
 
 
 @cache
-def _outline(kind: type[msgspec.Struct]) -> tuple[Any, tuple[tuple[str, str, Any], ...]]:
-    """Return the tag of records of *kind*; of each field name, key in JSON and default."""
+def _outline(
+    kind: type[msgspec.Struct],
+) -> tuple[tuple[tuple[str, Any], ...], tuple[tuple[str, str, Any], ...]]:
+    """Return the tag of records of *kind* with its key; of each field name, key and default."""
+    config = kind.__struct_config__
+    tag = () if config.tag_field is None else ((config.tag_field, config.tag),)
     fields = msgspec.structs.fields(kind)
-    return kind.__struct_config__.tag, tuple(
-        (field.name, field.encode_name, field.default) for field in fields
-    )
+    return tag, tuple((field.name, field.encode_name, field.default) for field in fields)

@@ -20,6 +20,7 @@ from eap.device.eap_dictionary import EapDictionary
 from eap.device.eap_spec import read_back
 from eap.errors import ConfigError, EnvironmentalError
 from eap.ids import decode_value, encode_value
+from eap.od.slave_config import IdnWrite, SdoWrite, SlaveConfig
 from eap.pd.device import DeviceState
 from eap.pd.spec import RxAlternateSpec, SentVariableSpec
 from eap.runtime import store as module
@@ -509,3 +510,9 @@ def test_lean_routing_keeps_fields_with_another_name_in_json():
     spec = RoutingSpec(access=(rule,))
     plain = msgspec.to_builtins(lean(spec), enc_hook=encode_value)
     assert msgspec.convert(plain, RoutingSpec, dec_hook=decode_value) == spec
+
+
+def test_lean_slave_configuration_keeps_the_kinds_of_its_writes():
+    writes = SdoWrite(index=0x6060, data=b"\1"), IdnWrite(idn=0x8001, data=b"\2")
+    spec = SlaveConfig(writes=writes)
+    assert msgspec.convert(msgspec.to_builtins(lean(spec)), SlaveConfig) == spec
