@@ -54,8 +54,7 @@ def control(monkeypatch):
     try:
         assert process.stdout is not None
         assert process.stdout.readline()
-        yield folder / "kiln" / "control"
-        assert process.wait(40) == 0  # the last exchange of the page stops it
+        yield folder / "kiln" / "control", process
     finally:
         process.kill()
         process.communicate()
@@ -70,10 +69,11 @@ def wait_for_data() -> None:
 
 
 def test_control_page_exchanges_match(control):
+    path, process = control
     wait_for_data()
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(20)
-        connection.connect(str(control))
+        connection.connect(str(path))
         reader = connection.makefile("rb")
         for line in LINES:
             if line.startswith("> "):
@@ -83,3 +83,4 @@ def test_control_page_exchanges_match(control):
                 assert outline(json.loads(reader.readline())) == told, line
         reader.close()
     assert len(LINES) > 30
+    assert process.wait(40) == 0  # the last exchange of the page stops it
