@@ -317,8 +317,8 @@ def test_snap7_reads_and_writes_the_served_blocks(plant: Appliance) -> None:
     client.connect("127.9.80.1", 0, 1, 2102)
     try:
         assert client.get_pdu_length() == 480
-        block = client.db_read(1, 0, 22)
-        assert struct.unpack_from(">fIf", block)[::2] == (21.5, 1.5)
+        # The server takes values every 20 ms.
+        wait_until(lambda: struct.unpack_from(">fIf", client.db_read(1, 0, 22))[::2] == (21.5, 1.5))
         client.db_write(1, 8, bytearray(struct.pack(">f", 6.25)))
         wait_until(lambda: plant.values("mill")["setpoint"] == 6.25)
         with pytest.raises(Exception, match=r"denied|not allowed|Access"):
