@@ -119,7 +119,7 @@ def read_file(path: Path) -> list[Download]:
 def _from_json(line: str) -> Download | None:
     try:
         row = msgspec.json.decode(line, type=_JsonEntry)
-    except msgspec.MsgspecError as exc:
+    except (ValueError, RecursionError) as exc:
         raise ValueError(f"not an entry as 'od dump --json' prints it: {exc}") from None
     # A dump has all entries; those that cannot be written are for its readers.
     if row.data is None or "w" not in row.access:

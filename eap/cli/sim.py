@@ -88,7 +88,7 @@ def parse_fault(words: tuple[str, ...]) -> dict[str, Any]:
 
         try:
             return msgspec.json.decode(words[0], type=dict[str, Any])
-        except msgspec.DecodeError as exc:
+        except (ValueError, RecursionError) as exc:
             raise click.UsageError(f"not a fault in JSON: {exc}") from None
     kind, *rest = words
     fault: dict[str, Any] = {"kind": kind}

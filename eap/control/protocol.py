@@ -286,7 +286,7 @@ def decode_request(line: bytes) -> Request:
     """Read one line of a client; raise ControlError with the reason if it is not a request."""
     try:
         request = _REQUEST.decode(line)
-    except msgspec.DecodeError as exc:
+    except ValueError as exc:  # of msgspec, or of UTF-8
         raise ControlError(f"not a request: {exc}", code=ErrorCode.BAD_REQUEST) from None
     except RecursionError:
         raise ControlError("not a request: nested too deep", code=ErrorCode.BAD_REQUEST) from None
@@ -328,7 +328,7 @@ def request_id(line: bytes) -> int | None:
     """Return the id of a line that is otherwise refused, so that its sender can match the error."""
     try:
         number = msgspec.json.decode(line)["id"]
-    except (msgspec.DecodeError, RecursionError, KeyError, TypeError):
+    except (ValueError, RecursionError, KeyError, TypeError):
         return None
     return number if isinstance(number, int) else None
 
@@ -337,7 +337,7 @@ def decode_reply(line: bytes) -> ControlReply:
     """Read one line of a server; raise ControlError if it is none."""
     try:
         return _REPLY.decode(line)
-    except msgspec.DecodeError as exc:
+    except (ValueError, RecursionError) as exc:
         raise ControlError(f"not an answer: {exc}", code=ErrorCode.BAD_REQUEST) from None
 
 

@@ -320,7 +320,7 @@ def read_header(memory: memoryview) -> tuple[ImageLayout, int]:
         raise ImageError(f"process image is cut off: {len(memory)} bytes of {size}")
     try:
         layout = msgspec.json.decode(memory[offset : offset + length], type=ImageLayout)
-    except msgspec.MsgspecError as exc:
+    except ValueError as exc:
         raise ImageError(f"process image has a damaged directory: {exc}") from None
     samples = layout.samples
     ends = (

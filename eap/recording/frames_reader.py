@@ -216,7 +216,7 @@ def events_in(comments: Iterable[str]) -> Iterator[RecordingEvent]:
     """Yield the events among the comments of a packet."""
     for comment in comments:
         if comment.startswith(EVENT_COMMENT):
-            with suppress(msgspec.MsgspecError):  # of a later release
+            with suppress(ValueError, RecursionError):  # of a later release
                 yield msgspec.json.decode(comment[len(EVENT_COMMENT) :], type=RecordingEvent)
 
 
@@ -240,7 +240,7 @@ def _section(
         if head.startswith(HEADER_COMMENT):
             try:
                 facts = msgspec.json.decode(head[len(HEADER_COMMENT) :], type=dict[str, str])
-            except msgspec.MsgspecError as exc:
+            except (ValueError, RecursionError) as exc:
                 raise MalformedError(f"damaged comment: {exc}", layout=str(path)) from None
             check_format(facts, str(path))
         elif head.startswith(PUBLISHED_COMMENT):

@@ -184,7 +184,7 @@ class RecorderProcess:
             if request.do == "mark":
                 recorder.mark(request.text, now_ns)
             answer = RecorderAnswer(state=recorder.check(now_ns))
-        except (EapError, msgspec.MsgspecError) as exc:
+        except (EapError, ValueError, RecursionError) as exc:
             answer = RecorderAnswer(error=str(exc))
         self._answer(client, answer)
 

@@ -101,5 +101,5 @@ def decode_published(octets: bytes) -> tuple[RecordedFrame, ...]:
     """Return the frames of :func:`encode_published`; raise ValueError if *octets* are none."""
     try:
         return msgspec.json.decode(octets, type=tuple[RecordedFrame, ...])
-    except msgspec.MsgspecError as exc:
+    except (ValueError, RecursionError) as exc:
         raise ValueError(f"the PDs of the plant cannot be read: {exc}") from None

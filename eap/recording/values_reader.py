@@ -120,7 +120,7 @@ class ValuesFile:
                 channel.metadata[VARIABLES], type=list[RecordedVariable]
             )
             messages = StationMessages(channel.metadata[STATION], pack_closely(variables))
-        except (KeyError, ValueError, msgspec.MsgspecError) as exc:
+        except (KeyError, ValueError, RecursionError) as exc:
             raise MalformedError(
                 f"channel {channel.topic} has damaged variables: {exc}", layout=str(path)
             ) from None
@@ -143,7 +143,7 @@ class ValuesFile:
                 if message.channel in channels:
                     try:
                         yield msgspec.json.decode(message.data, type=RecordingEvent)
-                    except msgspec.MsgspecError:
+                    except (ValueError, RecursionError):
                         continue  # of a later release
 
 

@@ -95,7 +95,7 @@ class BridgeFile:
         """Return the status, None if there is none."""
         try:
             return _DECODER.decode(self._path.read_bytes())
-        except (OSError, msgspec.DecodeError):
+        except (OSError, ValueError):
             return None
 
 

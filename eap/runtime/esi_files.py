@@ -233,7 +233,7 @@ def _read_cache(path: Path) -> dict[str, _ListedFile]:
     try:
         content = durable.unseal(path.read_bytes(), _VERSION)
         return msgspec.json.decode(content, type=dict[str, _ListedFile])
-    except (OSError, ConfigError, msgspec.MsgspecError):
+    except (OSError, ConfigError, ValueError):
         return {}
 
 

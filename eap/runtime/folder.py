@@ -326,7 +326,7 @@ def find_running() -> list[tuple[ApplianceFolder, ApplianceInfo]]:
     for folder in find_appliances():
         try:
             running.append((folder, folder.read_info()))
-        except (OSError, msgspec.MsgspecError):
+        except (OSError, ValueError):
             continue  # it is starting or stopping, or of another release
     return running
 

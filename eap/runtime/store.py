@@ -180,7 +180,7 @@ class StationFile(Generic[T]):
             value: T = msgspec.json.decode(
                 unseal(data, VERSION), type=self._kind, dec_hook=decode_value
             )
-        except msgspec.MsgspecError as exc:
+        except ValueError as exc:
             raise ConfigError(f"it holds no {self._what}: {exc}") from None
         return value
 

@@ -264,7 +264,7 @@ class _Loop:
             if isinstance(command, dict) and "id" in command:
                 outcome["id"] = command.pop("id")
             execute_command(self._segment, command, time.monotonic_ns())
-        except (msgspec.MsgspecError, ValueError) as exc:
+        except (ValueError, RecursionError) as exc:
             outcome |= {"ok": False, "error": str(exc)}
         return outcome
 

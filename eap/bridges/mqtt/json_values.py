@@ -197,7 +197,7 @@ def _content(kind: datatypes.DataType, payload: bytes) -> dict[str, Any]:
     """Return value and reference of a command; raise ValueError if the payload is no value."""
     try:
         value = msgspec.json.decode(payload)
-    except (msgspec.DecodeError, RecursionError):
+    except (ValueError, RecursionError):
         # A bare word is a text: programs that send one seldom add quotes.
         if not (kind.is_text or isinstance(kind, Enumeration)):
             reason = 'the payload is not JSON: send a value such as 7, true or {"value": 7}'

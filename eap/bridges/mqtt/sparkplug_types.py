@@ -188,7 +188,7 @@ def _plain_array(kind: Array, value: Any) -> Any:
     if isinstance(value, str):
         try:
             return msgspec.json.decode(value)
-        except (msgspec.DecodeError, RecursionError):
+        except (ValueError, RecursionError):
             raise ValueError("no JSON: expected an array") from None
     if not isinstance(value, DataSet):
         raise ValueError("no data set: expected one with a row for each element")  # noqa: TRY004

@@ -66,7 +66,7 @@ class SegmentLink:
         if not octets:
             self._loop.remove_reader(self._socket)
             return
-        with suppress(msgspec.MsgspecError):
+        with suppress(ValueError):
             answer = msgspec.json.decode(octets, type=dict[str, Any])
             # An answer after its time-out has no waiter any more.
             future = self._waiting.get(answer.get("id", 0))

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from eap.control import protocol as control
@@ -46,6 +46,8 @@ def test_decode_request_malformed_line_has_an_error_code(line, code):
 
 
 @given(st.binary(max_size=64))
+@example(b'{"v":1,"id":1,"method":"\xff"}')
+@example(b'{"v":1,"id":1,"other":' + b"[" * 100_000)
 def test_garbage_never_escapes(noise):
     control.request_id(noise)
     with suppress(ControlError):

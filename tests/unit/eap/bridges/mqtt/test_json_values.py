@@ -154,6 +154,7 @@ def test_command_is_json_with_or_without_an_id(name, payload, value, reference):
     ("topic", "payload", "is_retained", "reason"),
     [
         ("cell/mixer/setpoint/set", b"on", False, "not JSON"),
+        ("cell/mixer/setpoint/set", b'"\xff"', False, "not JSON"),
         ("cell/mixer/name/set", b"\xff", False, "utf-8"),
         ("cell/mixer/setpoint/set", b"[" * 100_000, False, "at most 65536 bytes"),
         ("cell/mixer/setpoint/set", b"[" * 60_000, False, "not JSON"),
