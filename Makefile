@@ -13,7 +13,7 @@ BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo valve test test-tools test-package properties check structure bench dist deb clean
+.PHONY: help setup demo valve test test-tools test-package fuzz properties check structure bench dist deb clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -58,6 +58,9 @@ test-package: deb  ## test wheel and Debian package (as root: in a clean Debian,
 	@sh tools/install_peers.sh package || echo 'make test-package: going on; what needs them is skipped and listed'
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --group deploy || echo 'make test-package: going on without Ansible'
 	@$(BIN)/python -m pytest tests/package $(ARGS)
+
+fuzz: setup  ## damage messages to each decoder and listening socket for SECONDS (10) each; finds are kept in .fuzz
+	@sh tools/isolated.sh $(BIN)/python -m tools.fuzz $(if $(SECONDS),--seconds '$(SECONDS)') $(ARGS)
 
 properties: setup  ## run the property tests with all their examples; make test takes a quarter
 	@$(PYTEST) -m hypothesis --hypothesis-profile=full tests $(ARGS)
