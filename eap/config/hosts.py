@@ -13,6 +13,7 @@ from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, is_local_only
 from eap.config.plant_sections import HostSection
 from eap.config.ports import check_names, resolve_destination
+from eap.config.servers import find_servers
 from eap.config.structs import PortSection, StationSection
 from eap.config.web import parse_listen
 from eap.errors import ConfigError
@@ -250,20 +251,17 @@ def _check_senders(index: Index, station: StationSection, report: FindingReport)
 
 
 def _check_servers(index: Index, report: FindingReport) -> None:
-    """Report a page, metrics or an OPC UA server at an address that no host has."""
-    for section in (index.plant.web, index.plant.metrics, index.plant.opcua):
-        if section is None:
-            continue
+    """Report servers of optional processes at an address that no host has."""
+    for server in find_servers(index.plant):
         try:
-            listen = parse_listen(section.listen)
-            address = IPv4Address(listen.host)
+            address = IPv4Address(server.listen.host)
         except ValueError:
-            continue  # a finding of its own, or IPv6
-        if listen.is_any or listen.is_loopback:
+            continue  # IPv6: the plant file does not say whose address it is
+        if server.listen.is_any or server.listen.is_loopback:
             continue
         if not any(has_address(host, address) for host in index.plant.hosts):
-            message = f"{section.KEY} listens at {listen.host}, which no host has"
-            report.add(f"{section.at}.listen", message, "an address of a host, or 127.0.0.1")
+            message = f"{server.name} listens at {server.listen.host}, which no host has"
+            report.add(server.at, message, "an address of a host, or 127.0.0.1")
 
 
 def _check_bridge_names(index: Index, report: FindingReport) -> None:

@@ -71,6 +71,7 @@ from eap.config.routes import (
     route_net_ids,
     stations_without_prefix,
 )
+from eap.config.servers import check_servers
 from eap.config.structs import (
     ANY_SOURCE,
     AuditMode,
@@ -597,6 +598,7 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
     check_mqtt(index, report, path.parent)
     check_opcua(index, report, path.parent)
     check_field(index, report)
+    check_servers(index, report)
     check_key_files(index, report, path.parent)
     check_hosts(index, report)
     check_recordings(index, report)

@@ -179,10 +179,6 @@ def check_web(index: Index, report: FindingReport, folder: Path) -> None:
     web, metrics = index.plant.web, index.plant.metrics
     if metrics is not None:
         _check_server(metrics, index, report, folder)
-        if web is not None and web.listen == metrics.listen:
-            message = f"listen: {metrics.listen} is the address of the page"
-            expected = "another port, or no such key: the page gives metrics, too"
-            report.add(f"{metrics.at}.listen", message, expected)
     if web is None:
         return
     _check_server(web, index, report, folder)

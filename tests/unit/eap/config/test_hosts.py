@@ -153,6 +153,14 @@ def test_part_of_a_host_has_its_stations_and_servers(loaded):
             "5: web listens at 10.9.9.9, which no",
         ),
         (
+            [("stations:\n", "s7: {server: {listen: 10.9.9.9:102, blocks: {1: []}}}\nstations:\n")],
+            "5: s7 listens at 10.9.9.9, which no host has; an address of a host, or 127.0.0.1",
+        ),
+        (
+            [("stations:\n", "modbus: {server: {listen: 10.9.9.9:502}}\nstations:\n")],
+            "5: modbus listens at 10.9.9.9, which no host has",
+        ),
+        (
             [("stations:\n", "mqtt: {broker: mqtt://b, client_id: x}\nstations:\n")],
             "5: client_id 'x' would be that of each host; none: each host then has one of its own",
         ),
