@@ -22,9 +22,7 @@ from eap.runtime.bridges import BridgeFile
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import BridgeHandover
 from eap.runtime.log import start_logging
-from eap.runtime.startup import Startup
-
-_ORPHAN_S = 1.0
+from eap.runtime.startup import LIFE_PERIOD_S, Startup
 
 SectionT = TypeVar("SectionT", bound=msgspec.Struct)
 
@@ -59,13 +57,13 @@ def run_bridge(
             handover.plant,
             folder.path.name,
             connect,
-            ready=partial(startup.finish, {}),
+            ready=partial(startup.finish, {}, is_watched=True),
             file=BridgeFile(folder.path, handover.name),
             pid=os.getpid(),
         )
         reason = ""
         try:
-            await _run(bridge, serve(bridge, section), handover.supervisor)
+            await _run(bridge, serve(bridge, section), startup, handover.supervisor)
         except* EnvironmentalError as group:
             reason = str(group.exceptions[0])
             if not bridge.is_ready:
@@ -78,7 +76,7 @@ def run_bridge(
     return 0
 
 
-async def _run(bridge: Bridge, work: Awaitable[None], parent: int) -> None:
+async def _run(bridge: Bridge, work: Awaitable[None], startup: Startup, parent: int) -> None:
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -93,8 +91,10 @@ async def _run(bridge: Bridge, work: Awaitable[None], parent: int) -> None:
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(each) for each in (bridge.report(), serve())]
         while not ended.is_set() and os.getppid() == parent:
+            if bridge.is_ready:
+                startup.beat()
             try:
-                async with asyncio.timeout(_ORPHAN_S):
+                async with asyncio.timeout(LIFE_PERIOD_S):
                     await ended.wait()
             except TimeoutError:
                 continue

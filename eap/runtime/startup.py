@@ -49,6 +49,8 @@ def catch_end_signals() -> Iterator[int]:
 Step: TypeAlias = Callable[[str], None]
 """Reports the beginning of a step."""
 
+LIFE_PERIOD_S = 1.0
+"""Interval in which a process that runs gives signs of life."""
 _IMPORT_PERIOD_S = 0.5
 """Interval of progress reports while a process imports."""
 
@@ -61,13 +63,16 @@ class Report(msgspec.Struct, frozen=True, omit_defaults=True):
     """Process without which this step cannot end."""
     ready: dict[str, Any] | None = None
     """Report of the process for ``status``, when it runs."""
+    is_watched: bool = False
+    """True if it gives signs of life from then on."""
 
 
 class Startup:
     """Start-up of this process, as the supervisor follows it.
 
     Args:
-        fd: Where reports go, one JSON object a line; closed when the process runs.
+        fd: Where reports go, one JSON object a line; closed when the process runs, unless it gives
+            signs of life.
     """
 
     def __init__(self, fd: int) -> None:
@@ -83,10 +88,22 @@ class Startup:
         with suppress(OSError):  # a supervisor that does not read, or has gone, stops no start
             self._write(report)
 
-    def finish(self, report: dict[str, Any]) -> None:
-        """Report that this process runs, with a *report* for ``status``."""
-        self._write(Report(ready=report))
-        os.close(self._fd)
+    def finish(self, report: dict[str, Any], *, is_watched: bool = False) -> None:
+        """Report that this process runs, with a *report* for ``status``.
+
+        Args:
+            report: Of this process.
+            is_watched: Whether it calls :meth:`beat` from now on: the supervisor kills it when it
+                stops to do so.
+        """
+        self._write(Report(ready=report, is_watched=is_watched))
+        if not is_watched:
+            os.close(self._fd)
+
+    def beat(self) -> None:
+        """Give a sign of life, from the loop that does the work; every ``LIFE_PERIOD_S``."""
+        with suppress(OSError):  # the supervisor has gone, or has not read for long
+            os.write(self._fd, b"\n")
 
     def _write(self, report: Report) -> None:
         os.write(self._fd, msgspec.json.encode(report) + b"\n")

@@ -42,7 +42,7 @@ from eap.runtime.handover import (
 )
 from eap.runtime.log import start_logging
 from eap.runtime.recordings import recording_findings
-from eap.runtime.startup import Startup, Step, no_step
+from eap.runtime.startup import LIFE_PERIOD_S, Startup, Step, no_step
 from eap.runtime.store import StationStore, plant_folder
 from eap.services.ads.station_ads import StationAds
 from eap.services.bus_table import BusFollower, BusTable
@@ -332,13 +332,19 @@ class Services:
             tasks.append(group.create_task(transports.serve()))
             tasks += [group.create_task(each.serve()) for each in (devices, audit, self._log)]
             tasks.append(group.create_task(hosts.serve()))
-            self._startup.finish({})
+            self._startup.finish({}, is_watched=True)
+            tasks.append(group.create_task(self._beat()))
             await self._stopping.wait()
             # Cancel rather than raise: the TaskGroup then waits until all connections are closed.
             for task in tasks:
                 task.cancel()
         await buses.close()
         transports.close()
+
+    async def _beat(self) -> None:
+        while True:
+            self._startup.beat()
+            await asyncio.sleep(LIFE_PERIOD_S)
 
     async def _open_image(self, station: str) -> StationImage:
         """Open one image; at the first start the engine creates it meanwhile.

@@ -9,6 +9,9 @@ A process that reports one step after the other may start without limit of time.
 no new step is stuck after a limit, which doubles with each start that got stuck: where 20 s are too
 short, because the machine is slow or full, 40 s or 80 s are not.  A start that succeeds restores
 the first limit.
+
+A process that runs gives signs of life by the same pipe.  They are counted in checks, not by the
+clock: a supervisor that was held itself, or a machine that slept, finds no process silent.
 """
 
 from __future__ import annotations
@@ -124,6 +127,33 @@ class StartWatch:
         return self._progress_ns + self.limit_ns
 
 
+LIFE_CHECK_NS = 5_000_000_000
+"""Interval of looks for signs of life."""
+SILENT_CHECKS = 4
+"""Looks in a row without one, after which a process hangs."""
+SILENCE_S = LIFE_CHECK_NS * SILENT_CHECKS // 1_000_000_000
+
+
+class LifeWatch:
+    """Signs of life of one process that runs.
+
+    Attributes:
+        has_hung: Whether it was silent for too long.
+    """
+
+    def __init__(self) -> None:
+        self.has_hung = False
+        self._silent = 0
+
+    def check(self, *, is_alive: bool) -> bool:
+        """Take note of a look; return True the first time that the process hangs."""
+        self._silent = 0 if is_alive else self._silent + 1
+        if self.has_hung or self._silent < SILENT_CHECKS:
+            return False
+        self.has_hung = True
+        return True
+
+
 FIRST_BACKOFF_NS = 100_000_000
 LONGEST_BACKOFF_NS = 5_000_000_000
 HEALTHY_AFTER_NS = 1_000_000_000
@@ -166,6 +196,7 @@ class Child:
         self.fault = ""
         """Reason that an optional process does not run, for ``status``."""
         self.is_ready = False
+        self._is_watched = False
         self._failures = 0
         """Ends since it was ready last."""
         self.report: dict[str, Any] = {}
@@ -175,6 +206,7 @@ class Child:
         self.error_fd = -1
         self.policy = RestartPolicy()
         self.watch = StartWatch()
+        self.life = LifeWatch()
         self._module = module
         self._process: subprocess.Popen[bytes] | None = None
         self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
@@ -226,28 +258,40 @@ class Child:
         self._process = process
         self.started_ns = now_ns
         self.watch.begin(now_ns)
-        self.is_ready = False
+        self.life = LifeWatch()
+        self.is_ready = self._is_watched = False
         self._last_lines.clear()
         self._partial_report = b""
 
     def read_reports(self) -> list[Report]:
         """Return what the process reported since the last time.
 
-        *report_fd* is closed when the process runs, and also if it died before.
+        *report_fd* is closed when the process runs, unless it gives signs of life by it, and also
+        if it died before.
         """
         # A report may come in two pieces; what follows the last newline waits for the rest.
         data = os.read(self.report_fd, 65536)
         *lines, self._partial_report = (self._partial_report + data).split(b"\n")
-        reports = [msgspec.json.decode(line, type=Report) for line in lines]
+        reports = [msgspec.json.decode(line, type=Report) for line in lines if line]
         for each in reports:
             if each.ready is not None:
                 self.is_ready = True
+                self._is_watched = each.is_watched
                 self._failures = 0
                 self.report = each.ready
-        if self.is_ready or not data:
+        if (self.is_ready and not self._is_watched) or not data:
             os.close(self.report_fd)
             self.report_fd = -1
         return reports
+
+    def has_beaten(self) -> bool:
+        """Return whether there was a sign of life since the last time, or none is due."""
+        if not self._is_watched or self.report_fd < 0:
+            return True
+        try:
+            return bool(os.read(self.report_fd, 65536))
+        except BlockingIOError:
+            return False
 
     def forward_output(self) -> bool:
         """Pass on what the process wrote; return whether there was anything.

@@ -37,7 +37,7 @@ from eap.runtime.handover import (
 from eap.runtime.socket_plan import require_own_buses
 from eap.runtime.startup import catch_end_signals
 from eap.runtime.store import StationStore, adopt_plant_file, effective
-from eap.supervisor.child import Child, StartEvent, describe_end
+from eap.supervisor.child import LIFE_CHECK_NS, SILENCE_S, Child, StartEvent, describe_end
 from eap.supervisor.log_output import LOG, LogForm, LogHandler
 from eap.supervisor.optional import missing_extra, optional_processes
 from eap.supervisor.part import load_part
@@ -192,6 +192,7 @@ class Supervisor:
         self._manager = ServiceManager(os.environ)
         station = plant.stations[0]
         self._progress = CycleProgress(folder.image(station.name), station.cycle_us)
+        self._life_ns = 0
         self._announced = False
         self._is_info_old = False
         self._exit_code: int | None = None
@@ -331,17 +332,19 @@ class Supervisor:
 
     def _timeout_ms(self) -> int:
         now_ns = self._clock()
-        deadlines = [*self._restart_ns.values(), *self._leaving.values()]
+        deadlines = [self._life_ns, *self._restart_ns.values(), *self._leaving.values()]
         timeouts = (child.watch.next_timeout() for child in self._children)
         deadlines += [each for each in (*timeouts, self._manager.next_ns) if each is not None]
-        return max(0, -(-(min(deadlines) - now_ns) // 1_000_000)) if deadlines else -1
+        return max(0, -(-(min(deadlines) - now_ns) // 1_000_000))
 
     def _wait(self, wake_fd: int, timeout_ms: int) -> None:
         poll = select.poll()
         poll.register(wake_fd, select.POLLIN)
         poll.register(self._sockets, select.POLLIN)
         for child in self._children:
-            for fd in (child.pid_fd, child.report_fd, child.error_fd):
+            # Signs of life are read in looks: each of them would wake this process.
+            report_fd = -1 if child.is_ready else child.report_fd
+            for fd in (child.pid_fd, report_fd, child.error_fd):
                 if fd >= 0:
                     poll.register(fd, select.POLLIN)
         fired = {fd for fd, _ in poll.poll(timeout_ms)}
@@ -408,7 +411,10 @@ class Supervisor:
             # A reason that the process knows is its last step: a line for each try would fill the
             # log.
             known = last_step if code == 2 and last_step else last_line
-            self._restart_extra(child, describe_end(code) if code <= 0 else known, lived_ns)
+            reason = describe_end(code) if code <= 0 else known
+            if child.life.has_hung:
+                reason = f"it gave no sign of life for {SILENCE_S} s"
+            self._restart_extra(child, reason, lived_ns)
             return
         never_ran = not child.watch.has_run and not child.watch.is_stuck
         if never_ran and self._refuse_bus(child, last_line.removeprefix("segment: ")):
@@ -485,6 +491,10 @@ class Supervisor:
                 self._leaving[child] = now_ns + GRACE_NS
         for child in self._children:
             self._check_start(child, now_ns)
+        if now_ns >= self._life_ns:
+            self._life_ns = now_ns + LIFE_CHECK_NS
+            for child in self._children:
+                self._check_life(child, now_ns)
         if (next_ns := self._manager.next_ns) is not None and now_ns >= next_ns:
             is_alive = all(child.is_alive for child in self._needed)
             self._manager.check(now_ns, is_alive=is_alive and self._progress.is_alive(now_ns))
@@ -504,6 +514,18 @@ class Supervisor:
                 step,
                 limit_s,
                 watch.limit_ns // 1_000_000_000,
+            )
+            child.send_signal(signal.SIGKILL)
+
+    def _check_life(self, child: Child, now_ns: int) -> None:
+        if not child.is_ready:
+            return
+        # The engine gives none beside its cycles.
+        cycles = self._progress.is_alive(now_ns) if child is self._engine else True
+        if child.life.check(is_alive=cycles and child.has_beaten()):
+            logger.error(
+                "%s hangs: no sign of life for %d s; it is killed and started again",
+                *(child.name, SILENCE_S),
             )
             child.send_signal(signal.SIGKILL)
 

@@ -25,13 +25,11 @@ from eap.live.view import LiveView
 from eap.runtime.durable import whole_file
 from eap.runtime.handover import WebHandover
 from eap.runtime.log import start_logging
-from eap.runtime.startup import Startup
+from eap.runtime.startup import LIFE_PERIOD_S, Startup
 from eap.runtime.store import plant_folder
 from eap.web.metrics import PATH, MetricsServer
 from eap.web.server import PageServer, open_listener, serving, tls_context
 from eap.web.sessions import KEY_BYTES
-
-_ORPHAN_S = 1.0
 
 logger = logging.getLogger(__name__)
 
@@ -50,9 +48,17 @@ def main(descriptor: int, startup: Startup) -> int:
         return 2
 
     def ready() -> None:
-        startup.finish({"url": page_url(section)})
+        startup.finish({"url": page_url(section)}, is_watched=True)
 
-    run(section, handover.plant, listener, context, ready=ready, parent=handover.supervisor)
+    run(
+        section,
+        handover.plant,
+        listener,
+        context,
+        ready=ready,
+        beat=startup.beat,
+        parent=handover.supervisor,
+    )
     return 0
 
 
@@ -69,6 +75,7 @@ def run(
     context: ssl.SSLContext | None,
     *,
     ready: Callable[[], None],
+    beat: Callable[[], None] = lambda: None,
     remote: Mapping[str, LiveClient] = {},
     parent: int = 0,
 ) -> None:
@@ -80,11 +87,12 @@ def run(
         listener: The listening socket.
         context: TLS settings.
         ready: Called when it serves.
+        beat: Called every ``LIFE_PERIOD_S`` from then on.
         remote: Remote appliances, which are shown instead.
         parent: Process without which it ends; 0 for none.
     """
     with listener:
-        asyncio.run(_serve(section, plant, listener, context, ready, remote, parent))
+        asyncio.run(_serve(section, plant, listener, context, ready, beat, remote, parent))
 
 
 async def _serve(
@@ -93,6 +101,7 @@ async def _serve(
     listener: socket.socket,
     context: ssl.SSLContext | None,
     ready: Callable[[], None],
+    beat: Callable[[], None],
     remote: Mapping[str, LiveClient],
     parent: int,
 ) -> None:
@@ -106,8 +115,9 @@ async def _serve(
     ):
         ready()
         while not ended.is_set() and (not parent or os.getppid() == parent):
+            beat()
             try:
-                async with asyncio.timeout(_ORPHAN_S):
+                async with asyncio.timeout(LIFE_PERIOD_S):
                     await ended.wait()
             except TimeoutError:
                 continue

@@ -17,6 +17,7 @@ from eap.runtime.bridges import BridgeFile
 from tests.support.appliance import Appliance, Plants, plants
 from tests.support.eventually import wait_until
 from tests.support.fakebridge import FileBridgeSection, start_bridge
+from tests.support.startup import read_reports
 
 pytestmark = pytest.mark.net
 
@@ -86,10 +87,10 @@ def bridge(plant: Appliance, folder: Path, name: str, *of: str) -> Iterator[Runn
     section = FileBridgeSection(str(folder / "out"), str(folder / "requests"), list(of))
     process, report = start_bridge(plant.runtime / "bridged", name, section)
     try:
-        with os.fdopen(report) as steps:
-            assert '"ready"' in steps.readlines()[-1]
+        assert read_reports(report)[-1].ready is not None
         yield RunningBridge(process, folder / "out", folder / "requests")
     finally:
+        os.close(report)
         process.kill()
         process.communicate()
 

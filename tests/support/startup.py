@@ -14,4 +14,4 @@ def read_reports(fd: int) -> list[Report]:
     data = b""
     while b'"ready"' not in data and (more := os.read(fd, 65536)):
         data += more
-    return [msgspec.json.decode(line, type=Report) for line in data.splitlines()]
+    return [msgspec.json.decode(line, type=Report) for line in data.splitlines() if line]

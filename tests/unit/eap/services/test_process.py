@@ -89,7 +89,7 @@ def test_services_answers_counts_and_ends_on_request(tmp_path, stations, number)
             assert client.request("hello")["stations"] == ["left", "right"]
             *steps, ready = read_reports(services.ready)
             assert Report("building station right") in steps
-            assert ready == Report(ready={})
+            assert ready == Report(ready={}, is_watched=True)
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
                 sender.sendto(EtherCatHeader(6, 0, 5).encode() + bytes(6), ("127.9.2.1", 34980))
             for _ in range(1000):

@@ -16,7 +16,9 @@ from eap.supervisor import child as module
 from eap.supervisor.child import (
     FIRST_LIMIT_NS,
     LONGEST_LIMIT_NS,
+    SILENT_CHECKS,
     Child,
+    LifeWatch,
     RestartPolicy,
     StartEvent,
     StartWatch,
@@ -64,6 +66,15 @@ def test_ends_have_words(code, words):
     assert words in describe_end(code)
 
 
+def test_life_is_given_up_after_several_looks_without_a_sign_in_a_row():
+    life = LifeWatch()
+    looks = [False, False, False, True, *[False] * SILENT_CHECKS, False, True]
+    assert [life.check(is_alive=each) for each in looks] == [
+        *[False] * (3 + SILENT_CHECKS), True, False, False,
+    ]  # fmt: skip
+    assert life.has_hung
+
+
 def make(tmp_path: Path, monkeypatch, code: str, bytecode: str = "") -> Child:
     (tmp_path / "eap_child_for_test.py").write_text(code)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path.cwd()}")
@@ -93,6 +104,35 @@ def test_from_start_to_end(tmp_path, monkeypatch, capfd):
     assert (child.pid, child.pid_fd, child.error_fd) == (0, -1, -1)
     assert not child.is_ready
     assert capfd.readouterr().err == "first line\nno newline\n"
+
+
+BEATS = """\
+import signal
+def main(handover_fd, startup):
+    signal.signal(signal.SIGUSR1, lambda *_: startup.beat())
+    startup.finish({}, is_watched=True)
+    while True:
+        signal.pause()
+"""
+
+
+@pytest.mark.net
+def test_signs_of_life_of_a_child_are_seen_once(tmp_path, monkeypatch):
+    child = make(tmp_path, monkeypatch, BEATS)
+    assert child.has_beaten(), "none is due"
+    child.start(HANDOVER, [], monotonic_ns())
+    while not child.is_ready:
+        wait(child.report_fd)
+        child.read_reports()
+    assert not child.has_beaten()
+    child.send_signal(signal.SIGUSR1)
+    wait(child.report_fd)
+    assert child.has_beaten()
+    assert not child.has_beaten()
+    child.send_signal(signal.SIGKILL)
+    wait(child.pid_fd)
+    assert child.reap()[0] == -signal.SIGKILL
+    assert child.report_fd == -1
 
 
 @pytest.mark.net

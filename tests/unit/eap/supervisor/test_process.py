@@ -15,6 +15,7 @@ import pytest
 from msgspec.structs import replace
 
 from eap.config.load import Plant
+from eap.config.web_sections import MetricsSection
 from eap.errors import ConfigError, EnvironmentalError
 from eap.ids import InterfaceUri, NetId
 from eap.pd.device import DeviceState
@@ -22,6 +23,7 @@ from eap.pd.spec import BusPortSpec, PortKind, PortSpec, RxPdSpec, TxFrameSpec, 
 from eap.runtime.folder import ApplianceFolder, find_appliances
 from eap.runtime.handover import EngineOptions, Handover
 from eap.runtime.store import StationStore, Stored, digest_of
+from eap.supervisor import process as module
 from eap.supervisor.child import Child
 from eap.supervisor.process import (
     Supervisor,
@@ -148,6 +150,48 @@ def test_supervisor_gives_children_that_got_stuck_more_time_and_never_gives_up(
     stuck = [line for line in caplog.messages if " is stuck: " in line]
     wanted = "no progress for 20 s; it is killed and started again, with 40 s for each step"
     assert stuck[0].endswith(wanted)
+
+
+def hold_when_it_runs(folder: ApplianceFolder, *names: str) -> None:
+    """Hold processes when all run, and end this one when others have taken their place."""
+
+    def pids() -> list[int]:
+        info = folder.read_info()
+        own = {"engine": info.engine, "services": info.services, **info.extras}
+        return [own[name].pid if name in own and not own[name].step else 0 for name in names]
+
+    try:
+        wait_until(lambda: all(pids()), timeout_s=60)
+        held = pids()
+        for pid in held:
+            os.kill(pid, signal.SIGSTOP)
+        wait_until(lambda: all(new and new not in held for new in pids()), timeout_s=60)
+    finally:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.net
+def test_supervisor_replaces_processes_that_hang(stations, caplog, capfd, monkeypatch):
+    monkeypatch.setattr(module, "LIFE_CHECK_NS", 800_000_000)  # signs come each second
+    options = EngineOptions(realtime=False)
+    info = make_info("demo", "demo.yaml", stations)
+    plant = Plant("x", stations, metrics=MetricsSection(listen="127.0.0.1:29464"))
+    with (
+        ApplianceFolder.claim("demo") as folder,
+        SharedSockets(folder.control_socket) as sockets,
+        ThreadPoolExecutor(1) as other,
+    ):
+        supervisor = Supervisor(info, plant, folder, sockets, options=options)
+        folder.write_info(info)
+        other.submit(hold_when_it_runs, folder, "engine", "services", "metrics")
+        assert supervisor.run() == 0
+        info = folder.read_info()
+        assert [info.engine.restarts, info.services.restarts] == [1, 1]
+        assert info.extras["metrics"].restarts == 1
+    for name in ("engine", "services", "metrics"):
+        wanted = f"{name} hangs: no sign of life for 20 s; it is killed and started again"
+        assert wanted in caplog.messages
+    assert '"ready":true' in capfd.readouterr().out
 
 
 def test_supervisor_tries_again_when_a_process_that_ran_cannot_be_started(
