@@ -175,8 +175,11 @@ class StationCapture(Closeable):
         Raises:
             ImageError: the new one cannot be opened yet.
         """
-        if not self._is_final and not (thoroughly and self._file.is_replaced):
-            return False
+        if not self._is_final:
+            # One that was retired after the last look has samples that were not read yet.
+            file = self._file
+            if not thoroughly or not file.is_replaced or file.retired:
+                return False
         self._exchange(open_image(self._path))
         return True
 

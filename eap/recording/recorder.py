@@ -152,6 +152,7 @@ class Attachment(Closeable):
                 self.frames = PortCapture(self._folder.frames)
             else:
                 self._open_stations()
+                self.layouts = self._read_layouts()
             if options.when:
                 self.condition = ConditionWatch(Condition(options.when), self._paths)
         except BaseException:
@@ -198,13 +199,16 @@ class Attachment(Closeable):
         """
         is_due = now_ns >= self._check_ns
         moved = [each.follow(thoroughly=is_due) for each in self._stations]
+        has_moved = any(moved)
         if self.condition is not None:
             self.condition.follow(thoroughly=is_due)
-        if not is_due and not any(moved):
+        # Frames have no captures that move.
+        if not is_due and not has_moved and self._stations:
             return False
-        self._check_ns = now_ns + _CHECK_NS
+        if is_due:
+            self._check_ns = now_ns + _CHECK_NS
         files = self._image_files()
-        if files == self._files:
+        if files == self._files and not has_moved:
             return False  # reading the directories of all images takes a while
         self._files = files
         layouts = self._read_layouts()
@@ -246,11 +250,13 @@ class Attachment(Closeable):
             raise ImageError(f"a process image is missing: {exc}") from None
 
     def _read_layouts(self) -> list[ImageLayout]:
-        layouts = []
-        for path in self._paths.values():
-            with open_image(path) as file:
-                layouts.append(file.image.layout)
-        return layouts
+        # Of an image that was replaced since the last look, there are samples to come.
+        found = {capture.layout.station: capture.layout for capture in self._stations}
+        for station, path in self._paths.items():
+            if station not in found:
+                with open_image(path) as file:
+                    found[station] = file.image.layout
+        return [found[station] for station in self._paths]
 
     def _facts(self, layouts: Sequence[ImageLayout]) -> Any:
         """Return what the header and the channels of a file say."""

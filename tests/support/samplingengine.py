@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from eap.net.image_file import ImageFile, create_image
+import msgspec
+
+from eap.net.image_file import ImageFile, create_image, prepare_image
 from eap.pd.image import Inputs, Sampler
 from eap.pd.layout import plan_layout
-from eap.pd.spec import StationSpec, Writer
+from eap.pd.spec import StationSpec, VariableSpec, Writer
 from eap.pd.words import StationWord
 
 CYCLE_NS = 10_000_000
@@ -26,6 +28,18 @@ class SamplingEngine:
         self.file = file
         self.image = file.image
         self.sampler = Sampler(file.image, Inputs(file.image).memory)
+
+    def change(self, *variables: VariableSpec) -> None:
+        """Go on with *variables* in front of the others, in another image."""
+        spec = msgspec.structs.replace(self.spec, variables=(*variables, *self.spec.variables))
+        fresh = prepare_image(self.path, plan_layout(spec), self.file.generation + 1)
+        fresh.move_to(self.path)
+        self.file.retire()
+        for word in (StationWord.CYCLE, StationWord.SAMPLED_UNTIL):
+            fresh.image.words[word] = self.image.words[word]
+        fresh.release()
+        self.file.close()
+        self.attach(fresh)
 
     def run(self, count: int = 1) -> None:
         """Run cycles."""

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from eap.net.framering_file import FrameRingFile
+from eap.pd.spec import VariableSpec
+from eap.pd.words import StationWord
 from eap.recording import recorder as module
-from eap.recording.recorder import Recorder, RecorderOptions
+from eap.recording.recorder import Attachment, Recorder, RecorderOptions
 from eap.recording.recording_file import describe, open_recording
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo
 from tests.support.samplingengine import SamplingEngine
@@ -27,11 +30,17 @@ class Recorded:
         self.offset_ns = UNIX_AT_0
         self.folder = ApplianceFolder.claim("demo")
         self.engine = SamplingEngine(self.folder.image("left"), left())
-        self.engine.run(5)
+        self.other = SamplingEngine(
+            self.folder.image("other"), msgspec.structs.replace(left(), name="other")
+        )
+        for engine in (self.engine, self.other):
+            engine.run(5)
         self.ring = FrameRingFile(self.folder.frames)
         (out / "demo.yaml").write_text("plant: demo\n")
         self.folder.write_info(
-            ApplianceInfo("demo", str(out / "demo.yaml"), ["left"], "2026-11-23T00:00:00Z", 1)
+            ApplianceInfo(
+                "demo", str(out / "demo.yaml"), ["left", "other"], "2026-11-23T00:00:00Z", 1
+            )
         )
         self.out = out
         self.now_ns = 0
@@ -39,6 +48,7 @@ class Recorded:
 
     def record(self, **options) -> Recorder:
         options.setdefault("kind", "values")
+        options.setdefault("patterns", ("left",))
         given = RecorderOptions(
             name="x",
             base=str(self.out / "x"),
@@ -72,6 +82,7 @@ class Recorded:
             recorder.end("closed", self.now_ns)
         self.ring.close()
         self.engine.file.close()
+        self.other.file.close()
         self.folder.close()
 
 
@@ -82,11 +93,12 @@ def recorded(tmp_path, tmp_path_factory, monkeypatch):
     made.close()
 
 
-def ticks(path: Path) -> list[int]:
+def ticks(path: Path, station: str = "left") -> list[int]:
     recording = open_recording(path)
-    (source,) = recording.sources
+    (source,) = (n for n, each in recording.sources.items() if each.station == station)
     names = [each.name for each in recording.sources[source].columns]
-    return [row.values[names.index("left/ticks")] for row in recording.rows()]
+    rows = recording.rows(sources={source})
+    return [row.values[names.index(f"{station}/ticks")] for row in rows]
 
 
 def test_recorder_writes_all_cycles_from_its_begin_to_its_end(recorded):
@@ -117,6 +129,38 @@ def test_clock_that_is_set_begins_another_file_in_which_times_grow(recorded):
     assert [each.text for each in second.events] == [
         "the clock of this host was set by -3600.000 s"
     ]
+
+
+def test_stations_that_change_at_once_keep_their_values(recorded, monkeypatch):
+    recorder = recorded.record(patterns=())
+    both = (recorded.engine, recorded.other)
+    for engine in both:
+        engine.run(10)
+    recorded.look()
+    more = VariableSpec("more", "LINT")
+    recorded.engine.change(more)
+    find = Attachment._image_files
+
+    def change_other(attachment: Attachment) -> list[int]:
+        """The other one changes behind the look, with two cycles that were not read yet."""
+        if recorded.other.spec.variables[0] != more:
+            recorded.other.run(2)
+            recorded.other.change(more)
+            recorded.other.spec = msgspec.structs.replace(
+                recorded.other.spec, variables=(more, *recorded.other.spec.variables)
+            )
+        return find(attachment)
+
+    monkeypatch.setattr(Attachment, "_image_files", change_other)
+    for _ in range(3):
+        recorded.look()
+        for engine in both:
+            engine.run(4)
+    recorder.end("stopped", recorded.now_ns)
+    for station, engine in zip(("left", "other"), both, strict=True):
+        found = [tick for path in recorded.files() for tick in ticks(path, station)]
+        assert found == list(range(7, engine.image.words[StationWord.CYCLE] + 1))
+    assert "other/more" in describe(recorded.files()[-1]).variables
 
 
 def test_ring_is_written_around_the_moment_of_its_condition(recorded):
