@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from eap.ams.spec import AccessService
+from eap.ams.spec import AccessService, TransportKind
 from eap.config.access import ALL, parse_services, rule_name
 from eap.config.brokers import brokers_of, parse_url
 from eap.config.field_sections import FieldServerSection, ModbusSection, S7Section
@@ -45,6 +45,8 @@ class Exposure(msgspec.Struct, frozen=True):
         place = f"{self.file}:{self.line}" if self.line else self.file
         return f"{place}: {self.message}; {self.remedy} ({self.requirement})"
 
+
+_FORGEABLE = {TransportKind.UDP, TransportKind.ETHERNET}
 
 Found = tuple[str, str, str, str]
 """Path in the file, requirement, message and remedy."""
@@ -106,6 +108,28 @@ def _writing(index: Index) -> Iterator[Found]:
                         f" through {by}"
                     ),
                     "from: the hosts that write",
+                )
+
+
+def _datagrams(index: Index) -> Iterator[Found]:
+    """Rules that let hosts write by datagrams and frames, which prove no sender."""
+    for station in index.plant.stations:
+        if not any(_is_reached(port) for port in station.ports):
+            continue
+        for number, rule in enumerate(station.access):
+            allowed = parse_services(rule.allow, allows=True) if rule.allow else ()
+            writes = ALL in rule.allow or set(allowed) - {AccessService.READ}
+            kinds = {each.partition(":")[0] for each in rule.transports or rule.doors}
+            is_known = bool(rule.networks or rule.roles)
+            if writes and is_known and (not kinds or kinds & _FORGEABLE):
+                yield (
+                    rule.at,
+                    "CR 2.1",
+                    (
+                        f"rule {rule_name(rule, number)} of {station.name} lets writing requests"
+                        " through by datagrams: any host can send them with another's address"
+                    ),
+                    "transports: [ams-tcp, tcp], or a network in which no host forges addresses",
                 )
 
 
@@ -268,6 +292,7 @@ _RULES: tuple[Callable[[Index], Iterable[Found]], ...] = (
     _audit,
     _reading,
     _writing,
+    _datagrams,
     _gateways,
     _signatures,
     _routes,

@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from msgspec.structs import replace
 
+from eap.ams.spec import Role
 from eap.config.access import parse_member
 from eap.config.finding import FindingReport
 from eap.config.index import Index
@@ -18,6 +19,8 @@ from eap.config.routes import SectionError
 from eap.config.selection import VariableNames
 from eap.config.users import PlantUserSection, check_users
 from eap.config.web_sections import ServerSection
+
+_EVERYWHERE = "0.0.0.0/0"
 
 ServerT = TypeVar("ServerT", bound=ServerSection | OpcUaSection)
 
@@ -64,10 +67,16 @@ def _places(
 ) -> Iterator[tuple[PlantUserSection, str]]:
     """Yield the valid addresses of a user, after reporting the others."""
     for position, text in enumerate(user.networks):
+        at = f"{user.at}.from[{position}]"
         try:
-            yield user, parse_member(text)
+            place = parse_member(text)
         except SectionError as exc:
-            report.add(f"{user.at}.from[{position}]", f"from: {exc}", exc.expected)
+            report.add(at, f"from: {exc}", exc.expected)
+            continue
+        if place == _EVERYWHERE and user.role is not Role.VIEWER:
+            message = f"from: {text}: every host would be {user.role} without a password"
+            report.add(at, message, "the addresses of this user")
+        yield user, place
 
 
 def _overlap(one: str, other: str) -> bool:

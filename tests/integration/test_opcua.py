@@ -245,6 +245,7 @@ def test_wrong_password_and_channel_without_security_are_refused(press):
     assert refusal(nothing, "nobody") == "BadUserAccessDenied"
     assert refusal(nothing, "anna", password="wrong") == "BadUserAccessDenied"
     assert refusal(nothing, "anna", CLOSED_URL) == "BadSecurityPolicyRejected"
+    wait_until(lambda: press.status()["logins"].get("opcua", {}).get("wrong") == 2)
 
 
 PEER = r"""

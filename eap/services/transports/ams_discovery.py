@@ -114,7 +114,8 @@ class RouteAdmin:
         for station, denial in zip(self._stations, denials, strict=True):
             wanted = _audited(station.router.net_id, request, sender, AdsError.NONE, "")
             # Recorded before the change, because an audit that is required must not miss it.
-            if why := station.router.why_not_recorded(wanted):
+            why = "" if denial else station.router.why_not_recorded(wanted)
+            if why:
                 result = AdsError.ACCESS
             else:
                 result, why = await _decide(station, request, sender, denial)

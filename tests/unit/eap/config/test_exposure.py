@@ -23,6 +23,7 @@ stations:
     access:
       - {{name: tools, allow: [write], net_ids: [10.0.7.20.1.1]}}
       - {{name: all, allow: [control]}}
+      - {{name: known, allow: [raw], from: [10.0.0.7], transports: ["udp:eap0"]}}
     routes: [{{mqtt: "mqtt://10.0.0.9", network: works}}]
     subscribe:
       - {{name: state, port: eap0, from: {{publisher: 10.0.0.2.2.1, id: 1}}, foreign: true,
@@ -45,22 +46,24 @@ FOUND = [
     (10, "CR 2.1", "press lets every host that reaches eap0, eap1 read all variables"),
     (11, "CR 2.1", "rule tools of press lets writing requests through by its source NetID alone"),
     (12, "CR 2.1", "rule all of press lets writing requests through of every host"),
-    (13, "CR 1.2", "press's broker mqtt://10.0.0.9 requires no login"),
-    (13, "CR 4.1", "press's broker mqtt://10.0.0.9 is reached without encryption"),
-    (16, "CR 3.1", "press takes state from any address"),
-    (15, "CR 3.1 RE 1", "press takes state without a signature"),
-    (19, "CR 1.1", "browsers without a login are viewer"),
-    (21, "CR 1.5", "others of this host may read word"),
-    (22, "CR 4.1", "the OPC UA server takes channels that are neither signed nor encrypted"),
-    (22, "CR 1.1", "OPC UA clients without a login are viewer"),
-    (22, "CR 1.9", "OPC UA clients need no certificate that is known"),
-    (23, "CR 1.1", "the Modbus server is reached by every host"),
-    (24, "CR 1.2", "the broker of values mqtt://10.0.0.9 requires no login"),
-    (24, "CR 4.1", "the broker of values mqtt://10.0.0.9 is reached without encryption"),
+    (13, "CR 2.1", "rule known of press lets writing requests through by datagrams"),
+    (14, "CR 1.2", "press's broker mqtt://10.0.0.9 requires no login"),
+    (14, "CR 4.1", "press's broker mqtt://10.0.0.9 is reached without encryption"),
+    (17, "CR 3.1", "press takes state from any address"),
+    (16, "CR 3.1 RE 1", "press takes state without a signature"),
+    (20, "CR 1.1", "browsers without a login are viewer"),
+    (22, "CR 1.5", "others of this host may read word"),
+    (23, "CR 4.1", "the OPC UA server takes channels that are neither signed nor encrypted"),
+    (23, "CR 1.1", "OPC UA clients without a login are viewer"),
+    (23, "CR 1.9", "OPC UA clients need no certificate that is known"),
+    (24, "CR 1.1", "the Modbus server is reached by every host"),
+    (25, "CR 1.2", "the broker of values mqtt://10.0.0.9 requires no login"),
+    (25, "CR 4.1", "the broker of values mqtt://10.0.0.9 is reached without encryption"),
 ]
 
 CLOSED = """\
 plant: cell
+users: [{name: panel, role: operator, from: [10.0.0.30]}]
 access: {audit: required}
 stations:
   - name: press
@@ -71,7 +74,8 @@ stations:
     pd_keys: keys
     learn: false
     access:
-      - {name: tools, allow: [write], from: [10.0.0.7]}
+      - {name: tools, allow: [write], from: [10.0.0.7], transports: [ams-tcp]}
+      - {name: panels, allow: [write], roles: [operator], transports: [ams-tcp]}
       - {name: rest, deny: [all], transports: [ams-tcp, udp, tcp, ethernet, mqtt]}
     subscribe:
       - {name: state, port: eap0, from: {publisher: 10.0.0.2.2.1, id: 1}, foreign: true,

@@ -85,6 +85,10 @@ def test_station_takes_engineers_of_the_plant_for_routes(tmp_path):
             "10.0.7.9/32 is viewer, and engineer as 10.0.7.0/24 of anna",
         ),
         (
+            ["users: [{name: eva, role: operator, from: [0.0.0.0/0]}]"],
+            "every host would be operator",
+        ),
+        (
             [f"users: [{OTTO}, {{name: eva, from: ['02:00:00:00:00:0a']}}]"],
             "02:00:00:00:00:0a is viewer, and operator",
         ),
