@@ -21,7 +21,7 @@ from eap.codec.ads import AdsError
 from eap.codec.adsnotification import (
     UNIT_NS,
     AddNotification,
-    Sample,
+    NotificationSample,
     Stamp,
     TransMode,
     encode_notification,
@@ -122,11 +122,11 @@ class _Outbox:
 
     def __init__(self) -> None:
         self.handles: set[int] = set()
-        self.stamps: list[tuple[int, list[Sample]]] = []
+        self.stamps: list[tuple[int, list[NotificationSample]]] = []
         self.size = 0
         self.deadline_ns = 0
 
-    def add(self, time: int, sample: Sample, deadline_ns: int) -> None:
+    def add(self, time: int, sample: NotificationSample, deadline_ns: int) -> None:
         if not self.stamps or deadline_ns < self.deadline_ns:
             self.deadline_ns = deadline_ns
         if not self.stamps or self.stamps[-1][0] != time:
@@ -295,7 +295,7 @@ class NotificationTable:
         notification.last = data
         self._samples += 1
         pending = self._clients[notification.client]
-        sample = Sample(notification.handle, data)
+        sample = NotificationSample(notification.handle, data)
         notices = []
         if pending.stamps and pending.size + sample.size > FULL_PACKET:
             notices.append(self._send(notification.client, pending))
@@ -306,7 +306,7 @@ class NotificationTable:
         client = notification.client
         pending = self._clients[client]
         notices = [self._send(client, pending)] if pending.stamps else []
-        data = encode_notification([Stamp(time, (Sample(notification.handle, b""),))])
+        data = encode_notification([Stamp(time, (NotificationSample(notification.handle, b""),))])
         self._packets += 1
         self._ended += 1
         self._remove(notification)

@@ -17,7 +17,7 @@ from eap.ams.routes import Route
 from eap.codec.adsnotification import (
     UNIT_NS,
     AddNotification,
-    Sample,
+    NotificationSample,
     Stamp,
     TransMode,
     decode_notification,
@@ -144,7 +144,7 @@ class Subscription:
         time = self.time + (now_ns - self.received_at_ns) // UNIT_NS if self.time else 0
         # The end is a sample without bytes, as TwinCAT sends it, alone in its packet, because
         # AdsLib skips what follows such a sample.
-        body = encode_notification([Stamp(time, (Sample(self.handle, b""),))])
+        body = encode_notification([Stamp(time, (NotificationSample(self.handle, b""),))])
         server, port, client, client_port = ADDRESSES.unpack(self.addresses)
         header = AmsHeader(NetId(client), client_port, NetId(server), port, AmsCommand.NOTIFICATION)
         return encode_packet(header, body)
@@ -318,7 +318,7 @@ def divide(
     Raises:
         CodecError: the notification is shorter or longer than it says.
     """
-    parts: dict[tuple[Endpoint, bytes], list[tuple[int, Sample]]] = {}
+    parts: dict[tuple[Endpoint, bytes], list[tuple[int, NotificationSample]]] = {}
     ended: list[Subscription] = []
     unknown: list[int] = []
     hop: Endpoint | None = None
@@ -342,7 +342,7 @@ def divide(
                 if sample.handle == found.handle:
                     mine.append((stamp.time, sample))
                 else:
-                    mine.append((stamp.time, Sample(found.handle, sample.data)))
+                    mine.append((stamp.time, NotificationSample(found.handle, sample.data)))
                     is_as_it_came = False
     # The usual case, one client and nothing to change: the body is sent without encoding it again.
     if len(parts) == 1 and is_as_it_came:
@@ -374,8 +374,8 @@ def key_of(grant: Grant) -> tuple[bytes, int]:
     return grant.onward, grant.handle
 
 
-def _join(samples: list[tuple[int, Sample]]) -> bytes:
-    stamps: dict[int, list[Sample]] = {}
+def _join(samples: list[tuple[int, NotificationSample]]) -> bytes:
+    stamps: dict[int, list[NotificationSample]] = {}
     for time, sample in samples:
         stamps.setdefault(time, []).append(sample)
     return encode_notification(Stamp(time, tuple(each)) for time, each in stamps.items())

@@ -13,7 +13,7 @@ from eap.cli.output import Column, Renderer, TextTable
 from eap.cli.params import examples, json_option
 
 if TYPE_CHECKING:
-    from eap.ops.pd_keys import PdKey
+    from eap.ops.pd_keys import KeyInfo
 
 _FILE = click.argument("file", type=click.Path(dir_okay=False, path_type=Path))
 _NUMBER = click.argument("number", type=click.IntRange(1, 0xFFFF))
@@ -84,7 +84,7 @@ def remove(file: Path, number: int, output: Renderer) -> None:
     output.show_rows(remove_key(file, number), _tables)
 
 
-def _tables(rows: Iterable[PdKey]) -> Iterator[TextTable]:
+def _tables(rows: Iterable[KeyInfo]) -> Iterator[TextTable]:
     table = TextTable(Column("Key", is_number=True), "Fingerprint", "Use")
     for row in rows:
         table.add_row(str(row.number), row.fingerprint, "signs" if row.signs else "accepted")

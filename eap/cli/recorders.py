@@ -17,7 +17,7 @@ from eap.quantities import count, duration
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from eap.config.record_texts import Distance, Division
+    from eap.config.record_texts import Distance, FileSplit
     from eap.runtime.recordings import RecordingState
 
 
@@ -55,12 +55,12 @@ def _parse_every(ctx: click.Context, param: click.Parameter, text: str) -> Dista
         raise click.BadParameter(str(exc)) from None
 
 
-def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -> Division:
-    from eap.config.record_texts import Division, parse_split
+def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -> FileSplit:
+    from eap.config.record_texts import FileSplit, parse_split
 
     del ctx, param
     try:
-        return Division() if text is None else parse_split(text)
+        return FileSplit() if text is None else parse_split(text)
     except ValueError as exc:
         raise click.BadParameter(str(exc)) from None
 
@@ -146,7 +146,7 @@ def start(
     when: str | None,
     before_ns: int | None,
     after_ns: int | None,
-    split: Division,
+    split: FileSplit,
     keep: int | None,
     to: str | None,
     plant: str | None,

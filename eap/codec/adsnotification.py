@@ -63,7 +63,7 @@ class _SampleHead(WireStruct, frozen=True):
     size: u32
 
 
-class Sample(NamedTuple):
+class NotificationSample(NamedTuple):
     """One value of one notification."""
 
     handle: int
@@ -79,7 +79,7 @@ class Stamp(NamedTuple):
     """Samples taken at one time, in 100 ns since 1601 (FILETIME)."""
 
     time: int
-    samples: tuple[Sample, ...]
+    samples: tuple[NotificationSample, ...]
 
 
 def to_filetime(unix_ns: int) -> int:
@@ -127,7 +127,7 @@ def decode_notification(data: Buffer) -> list[Stamp]:
     return stamps
 
 
-def _decode_sample(data: Buffer, at: int) -> tuple[Sample, int]:
+def _decode_sample(data: Buffer, at: int) -> tuple[NotificationSample, int]:
     head = _SampleHead.decode(data, at)
     start = at + _SampleHead.SIZE
     octets = bytes(data[start : start + head.size])
@@ -137,4 +137,4 @@ def _decode_sample(data: Buffer, at: int) -> tuple[Sample, int]:
             layout="DeviceNotification",
             offset=at,
         )
-    return Sample(head.handle, octets), start + head.size
+    return NotificationSample(head.handle, octets), start + head.size

@@ -98,8 +98,8 @@ TOO_LONG = 0x8500
 """Error of a reply: the PDU is too long."""
 
 
-class Transport(IntEnum):
-    """Type of the elements of an item in a request."""
+class TransportSize(IntEnum):
+    """Transport size of an item in a request: the type of its elements."""
 
     BIT = 0x01
     BYTE = 0x02
@@ -156,18 +156,18 @@ class S7Pdu(NamedTuple):
 
 
 class S7Item(NamedTuple):
-    """Address of an item: *number* elements of type *transport* from bit *start* on."""
+    """Address of an item: *number* elements of type *transport_size* from bit *start* on."""
 
     area: int
     block: int
     start: int
-    transport: int
+    transport_size: int
     number: int
 
     @property
     def bits(self) -> int:
         """Number of bits, 0 for a type that is not known."""
-        return self.number * _ELEMENT_BITS.get(self.transport, 0)
+        return self.number * _ELEMENT_BITS.get(self.transport_size, 0)
 
     @property
     def size(self) -> int:
@@ -177,20 +177,20 @@ class S7Item(NamedTuple):
     @property
     def is_bit(self) -> bool:
         """True for single bits."""
-        return self.transport == Transport.BIT
+        return self.transport_size == TransportSize.BIT
 
     def encode(self) -> bytes:
         """Return the address."""
         place = self.start.to_bytes(3, "big")
-        head = 0x12, 0x0A, 0x10, self.transport, self.number, self.block, self.area
+        head = 0x12, 0x0A, 0x10, self.transport_size, self.number, self.block, self.area
         return struct.pack(">BBBBHHB", *head) + place
 
 
 def data_item(area: int, block: int, first: int, bits: int) -> S7Item:
     """Return the item of *bits* bits from bit *first* on: a single bit, or whole bytes."""
     if bits == 1:
-        return S7Item(area, block, first, Transport.BIT, 1)
-    return S7Item(area, block, first, Transport.BYTE, bits // 8)
+        return S7Item(area, block, first, TransportSize.BIT, 1)
+    return S7Item(area, block, first, TransportSize.BYTE, bits // 8)
 
 
 class ItemData(NamedTuple):
@@ -316,9 +316,9 @@ def decode_items(parameters: bytes) -> list[S7Item]:
             raise TruncatedError(f"item {len(found) + 1} is cut off", layout="S7 items")
         length = parameters[at + 1]
         if parameters[at] == 0x12 and length == ITEM_SIZE - 2 and parameters[at + 2] == 0x10:
-            transport, count, block, area = struct.unpack_from(">BHHB", parameters, at + 3)
+            transport_size, count, block, area = struct.unpack_from(">BHHB", parameters, at + 3)
             start = int.from_bytes(parameters[at + 9 : at + 12], "big")
-            found.append(S7Item(area, block, start, transport, count))
+            found.append(S7Item(area, block, start, transport_size, count))
         else:
             found.append(S7Item(0, 0, 0, 0, 0))
         at += 2 + length

@@ -81,8 +81,8 @@ class Metric(NamedTuple):
     properties: Sequence[tuple[str, int | float | bool | str]] = ()
 
 
-class Payload(NamedTuple):
-    """Decoded message; *time_ms* and *seq* are None where it has none."""
+class SparkplugPayload(NamedTuple):
+    """Decoded payload; *time_ms* and *seq* are None where it has none."""
 
     time_ms: int | None
     seq: int | None
@@ -212,7 +212,7 @@ def _encode_template(value: Template) -> bytes:
     return b"".join(parts)
 
 
-def decode_payload(data: bytes) -> Payload:
+def decode_payload(data: bytes) -> SparkplugPayload:
     """Read a message.
 
     Raises:
@@ -228,7 +228,7 @@ def decode_payload(data: bytes) -> Payload:
             metrics.append(_decode_metric(_octets(content), room, _MAX_DEPTH))
         elif number == 3:
             seq = _number(content)
-    return Payload(time_ms, seq, metrics)
+    return SparkplugPayload(time_ms, seq, metrics)
 
 
 def _decode_metric(data: bytes, room: list[int], depth: int) -> Metric:

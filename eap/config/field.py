@@ -220,7 +220,7 @@ class _Layout:
         return register_bit(int(number), int(bit)) if unit == 16 else 8 * int(number) + int(bit)
 
 
-class _Area(NamedTuple):
+class _ServedArea(NamedTuple):
     """Area of a server with its sections."""
 
     layout: _Layout
@@ -263,7 +263,7 @@ class _Served:
         except ValueError as exc:
             self._report.add(f"{server.at}.listen", str(exc), _LISTEN)
 
-    def _blocks(self, server: S7ServerSection) -> Iterator[_Area]:
+    def _blocks(self, server: S7ServerSection) -> Iterator[_ServedArea]:
         for key, sections in server.blocks.items():
             path = f"{server.at}.blocks.{key}"
             number = key.upper().removeprefix("DB")
@@ -271,16 +271,16 @@ class _Served:
                 self._report.add(path, f"data block {key!r}", "a number from 1 to 65535")
                 continue
             layout = _Layout(f"DB{int(number)}", words_swapped=False, bytes_swapped=False)
-            yield _Area(layout, sections, path)
+            yield _ServedArea(layout, sections, path)
 
-    def _tables(self, server: ModbusServerSection) -> Iterator[_Area]:
+    def _tables(self, server: ModbusServerSection) -> Iterator[_ServedArea]:
         words, octets = server.word_order is Order.LITTLE, server.byte_order is Order.LITTLE
         for table in ModbusTable:
             layout = _Layout(table, words_swapped=words, bytes_swapped=octets)
             sections: tuple[ServedSection, ...] = getattr(server, table)
-            yield _Area(layout, sections, f"{server.at}.{table}")
+            yield _ServedArea(layout, sections, f"{server.at}.{table}")
 
-    def items(self, area: _Area) -> Iterator[ServedItem]:
+    def items(self, area: _ServedArea) -> Iterator[ServedItem]:
         """Yield the variables of an area with their addresses; what is wrong is reported."""
         count = 0
         for section in area.sections:
@@ -303,7 +303,7 @@ class _Served:
         return match_names(section.of, self._names.names)
 
     def _item(
-        self, area: _Area, section: ServedSection, name: str, first: str
+        self, area: _ServedArea, section: ServedSection, name: str, first: str
     ) -> ServedItem | None:
         station_name, _, variable = name.partition("/")
         station = self._index.stations.get(station_name)

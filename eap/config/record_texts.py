@@ -40,7 +40,7 @@ class Distance(NamedTuple):
     every_ms: int = 0
 
 
-class Division(NamedTuple):
+class FileSplit(NamedTuple):
     """Longest time or largest size of a file, 0 for no limit."""
 
     split_ns: int = 0
@@ -79,17 +79,17 @@ def parse_every(text: str | int) -> Distance:
     return Distance(1, number) if match[2] else Distance(number)
 
 
-def parse_split(text: str) -> Division:
-    """Return the division of files; raise ValueError if *text* is none."""
+def parse_split(text: str) -> FileSplit:
+    """Return the limit of a file, a time or a size; raise ValueError if *text* is none."""
     match = _AMOUNT.fullmatch(text.strip())
     if match and (unit := _BYTES.get(match[2].upper())):
         size = int(float(match[1]) * unit)
         if size >= 1:
-            return Division(split_bytes=size)
+            return FileSplit(split_bytes=size)
     elif match and (seconds := _SECONDS.get(match[2].lower())):
         ns = int(float(match[1]) * seconds * 1e9)
         if 0 < ns <= LONGEST_NS:
-            return Division(ns)
+            return FileSplit(ns)
     raise ValueError(f"{text!r}: expected a time such as 1h, or a size such as 1GB")
 
 
@@ -135,12 +135,12 @@ def times_of(section: RecordSection) -> RecordTimes:
     return completed(times, section.when)
 
 
-def division_of(section: RecordSection) -> Division:
-    """Return the division of a section that has no findings, with its default."""
+def split_of(section: RecordSection) -> FileSplit:
+    """Return the file limits of a section that has no findings, with their default."""
     if section.split:
         return parse_split(section.split)
     needs_none = section.to or section.ring or section.when
-    return Division() if needs_none else Division(SPLIT_NS)
+    return FileSplit() if needs_none else FileSplit(SPLIT_NS)
 
 
 def matcher(patterns: Iterable[str]) -> Callable[[str], bool]:

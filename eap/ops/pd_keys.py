@@ -14,7 +14,7 @@ from eap.pd.authentication import KEY_SIZE, Keys
 from eap.runtime.durable import whole_file
 
 
-class PdKey(Struct, frozen=True):
+class KeyInfo(Struct, frozen=True):
     """A key, without telling it."""
 
     number: int
@@ -22,7 +22,7 @@ class PdKey(Struct, frozen=True):
     signs: bool
 
 
-def list_keys(path: Path) -> list[PdKey]:
+def list_keys(path: Path) -> list[KeyInfo]:
     """Return the keys of a file, the signing one first.
 
     Raises:
@@ -31,7 +31,7 @@ def list_keys(path: Path) -> list[PdKey]:
     return _described(read_keys(path))
 
 
-def add_key(path: Path) -> list[PdKey]:
+def add_key(path: Path) -> list[KeyInfo]:
     """Add a new random key, which is accepted and does not sign unless it is the only one.
 
     Raises:
@@ -46,7 +46,7 @@ def add_key(path: Path) -> list[PdKey]:
     return _write(path, Keys(content, keys.signing or number))
 
 
-def sign_with(path: Path, number: int) -> list[PdKey]:
+def sign_with(path: Path, number: int) -> list[KeyInfo]:
     """Have a key sign.
 
     Raises:
@@ -57,7 +57,7 @@ def sign_with(path: Path, number: int) -> list[PdKey]:
     return _write(path, keys._replace(signing=number))
 
 
-def remove_key(path: Path, number: int) -> list[PdKey]:
+def remove_key(path: Path, number: int) -> list[KeyInfo]:
     """Remove a key that does not sign.
 
     Raises:
@@ -78,7 +78,7 @@ def _find(path: Path, keys: Keys, number: int) -> None:
         raise EnvironmentalError(f"{path}: there is no key {number}; it has {known}")
 
 
-def _write(path: Path, keys: Keys) -> list[PdKey]:
+def _write(path: Path, keys: Keys) -> list[KeyInfo]:
     with whole_file(path) as file:
         # Before a byte of a key is in it.
         os.fchmod(file.fileno(), 0o600)
@@ -86,9 +86,9 @@ def _write(path: Path, keys: Keys) -> list[PdKey]:
     return _described(keys)
 
 
-def _described(keys: Keys) -> list[PdKey]:
+def _described(keys: Keys) -> list[KeyInfo]:
     rows = [
-        PdKey(number, fingerprint(key), number == keys.signing)
+        KeyInfo(number, fingerprint(key), number == keys.signing)
         for number, key in keys.by_number.items()
     ]
     return sorted(rows, key=lambda row: (not row.signs, row.number))

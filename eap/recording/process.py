@@ -22,7 +22,7 @@ from time import monotonic_ns
 
 import msgspec
 
-from eap.config.record_texts import KEEP, division_of, parse_every, times_of
+from eap.config.record_texts import KEEP, parse_every, split_of, times_of
 from eap.errors import EapError, EnvironmentalError
 from eap.recording.recorder import Recorder, RecorderOptions
 from eap.runtime.handover import RecorderHandover
@@ -228,7 +228,7 @@ def plant_options(handover: RecorderHandover) -> RecorderOptions:
         patterns=record.patterns,
         **parse_every(record.every)._asdict(),
         **times_of(record)._asdict(),
-        **division_of(record)._asdict(),
+        **split_of(record)._asdict(),
         when=record.when,
         keep=0 if record.to else record.keep or KEEP,
         to=record.to,

@@ -214,7 +214,7 @@ class _Segment(NamedTuple):
     data: bytes
 
 
-class _Connection:
+class _TcpConnection:
     __slots__ = ("answer", "expected", "has_ended", "request", "start")
 
     def __init__(self, expected: int, start: int) -> None:
@@ -236,7 +236,7 @@ class TcpServer:
 
     def __init__(self, respond: Callable[[bytes], bytes]) -> None:
         self._respond = respond
-        self._connections: dict[tuple[bytes, int], _Connection] = {}
+        self._connections: dict[tuple[bytes, int], _TcpConnection] = {}
         self._count = 0
 
     def receive_segment(self, source: bytes, own: bytes, octets: bytes) -> list[bytes]:
@@ -263,17 +263,17 @@ class TcpServer:
             for part in parts
         ]
 
-    def _open(self, key: tuple[bytes, int], segment: _Segment) -> _Connection:
+    def _open(self, key: tuple[bytes, int], segment: _Segment) -> _TcpConnection:
         self._count += 1
         start = crc32(self._count.to_bytes(4) + key[0])
         self._connections.pop(key, None)
-        connection = self._connections[key] = _Connection(segment.sequence + 1, start + 1)
+        connection = self._connections[key] = _TcpConnection(segment.sequence + 1, start + 1)
         if len(self._connections) > MAX_CONNECTIONS:
             del self._connections[next(iter(self._connections))]
         return connection
 
     def _continue(
-        self, key: tuple[bytes, int], connection: _Connection, segment: _Segment
+        self, key: tuple[bytes, int], connection: _TcpConnection, segment: _Segment
     ) -> list[tuple[int, int, bytes]]:
         """Return sequence number, flags and data of the answers to a segment."""
         is_next = (segment.sequence - connection.expected) & 0xFFFF_FFFF == 0

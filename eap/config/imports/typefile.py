@@ -27,7 +27,7 @@ IGNORED = "ImageData", "Format", "Hides", "Method"
 _AREAS = {"InputDst": "input", "OutputSrc": "output"}
 
 
-class RecordKind(StrEnum):
+class TypeKind(StrEnum):
     """Kind of a type in a file."""
 
     STRUCT = "struct"
@@ -100,18 +100,18 @@ class TypeRecord(msgspec.Struct, frozen=True, kw_only=True):
     line: int = 0
 
     @property
-    def kind(self) -> RecordKind:
+    def kind(self) -> TypeKind:
         """Kind of the type, by what the file says of it."""
         if self.values:
-            return RecordKind.ENUM
+            return TypeKind.ENUM
         if self.bounds:
-            return RecordKind.ARRAY
+            return TypeKind.ARRAY
         if self.members or self.extends or not self.base:
             # A union has no mark: all of its members begin at 0.
             several = len(self.members) > 1 and not self.extends
             is_union = several and all(not each.bit_offset for each in self.members)
-            return RecordKind.UNION if is_union else RecordKind.STRUCT
-        return RecordKind.ALIAS
+            return TypeKind.UNION if is_union else TypeKind.STRUCT
+        return TypeKind.ALIAS
 
 
 class SymbolRecord(msgspec.Struct, frozen=True, kw_only=True):

@@ -170,7 +170,7 @@ _ENGINE_PAUSE_NS = 10_000_000
 logger = logging.getLogger(__name__)
 
 
-class _Device(NamedTuple):
+class _NotificationSource(NamedTuple):
     table: NotificationTable
     net_id: NetId
     port: int
@@ -187,7 +187,7 @@ class NotificationPump:
     def __init__(self, symbols: StationSymbols, send: Send) -> None:
         self._symbols = symbols
         self._send = send
-        self._devices: list[_Device] = []
+        self._sources: list[_NotificationSource] = []
         self._wake = asyncio.Event()
         self._samples: ImageSamples | None = None
         self._last_cycle = 0
@@ -195,12 +195,12 @@ class NotificationPump:
 
     def add(self, table: NotificationTable, net_id: NetId, port: int) -> None:
         """Drive *table* too, which is that of the device behind *net_id* and *port*."""
-        self._devices.append(_Device(table, net_id, port))
+        self._sources.append(_NotificationSource(table, net_id, port))
         table.on_add = self._wake.set
 
     def remove(self, net_id: NetId) -> None:
         """Drive no tables of devices behind *net_id* any more."""
-        self._devices = [device for device in self._devices if device.net_id != net_id]
+        self._sources = [each for each in self._sources if each.net_id != net_id]
 
     async def serve(self) -> None:
         """Send notifications until cancelled."""
@@ -266,7 +266,7 @@ class NotificationPump:
     def _send_cycle(self, at_ns: int, time: int) -> int:
         """Send the notifications of one cycle; return the number of values compared, at most."""
         compared = 0
-        for table, net_id, port in self._devices:
+        for table, net_id, port in self._sources:
             due_ns = table.next_timeout()
             if due_ns is not None and due_ns <= at_ns:
                 compared += len(table)
@@ -275,7 +275,7 @@ class NotificationPump:
         return compared
 
     def _due_ns(self) -> int | None:
-        times = (device.table.next_timeout() for device in self._devices)
+        times = (each.table.next_timeout() for each in self._sources)
         return min((each for each in times if each is not None), default=None)
 
     def _delay_ns(self, now_ns: int) -> int | None:

@@ -17,7 +17,7 @@ from eap.ads.request import AdsRefusedError
 from eap.codec.ads import AdsError
 from eap.codec.adsnotification import (
     AddNotification,
-    Sample,
+    NotificationSample,
     Stamp,
     TransMode,
     decode_notification,
@@ -61,7 +61,9 @@ def cycle(table: NotificationTable, now_ms: float) -> list[tuple[object, list[St
 
 
 def stamp(now_ms: float, *samples: tuple[int, bytes]) -> Stamp:
-    return Stamp(to_filetime(int(now_ms * MS)), tuple(Sample(*sample) for sample in samples))
+    return Stamp(
+        to_filetime(int(now_ms * MS)), tuple(NotificationSample(*sample) for sample in samples)
+    )
 
 
 @pytest.fixture

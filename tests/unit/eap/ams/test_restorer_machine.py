@@ -10,7 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 from eap.ams.transport_table import Action, Forward, Reply
 from eap.codec.adsnotification import (
     AddNotification,
-    Sample,
+    NotificationSample,
     Stamp,
     TransMode,
     decode_notification,
@@ -48,7 +48,7 @@ class Server:
 
     def sample(self, handles: list[int], *, is_end: bool = False) -> Ams:
         samples = [
-            Sample(each, b"" if is_end else self.watched[each].to_bytes(4, "little"))
+            NotificationSample(each, b"" if is_end else self.watched[each].to_bytes(4, "little"))
             for each in handles
         ]
         packets = [Stamp(1, (each,)) for each in samples]

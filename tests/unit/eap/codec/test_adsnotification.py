@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from eap.codec.adsnotification import (
     AddNotification,
-    Sample,
+    NotificationSample,
     Stamp,
     TransMode,
     decode_notification,
@@ -19,14 +19,14 @@ from eap.errors import CodecError, MalformedError, TruncatedError
 from tests.support.wirerecords import records
 
 U32 = st.integers(0, 0xFFFF_FFFF)
-SAMPLES = st.builds(Sample, U32, st.binary(max_size=20))
+SAMPLES = st.builds(NotificationSample, U32, st.binary(max_size=20))
 STAMPS = st.builds(Stamp, st.integers(0, (1 << 64) - 1), st.lists(SAMPLES, max_size=4).map(tuple))
 
 
 def test_notification_packet_matches_wire_layout() -> None:
     stamps = [
-        Stamp(0x01DA, (Sample(1, b"ab"), Sample(2, b""))),
-        Stamp(0x01DB, (Sample(1, b"c"),)),
+        Stamp(0x01DA, (NotificationSample(1, b"ab"), NotificationSample(2, b""))),
+        Stamp(0x01DB, (NotificationSample(1, b"c"),)),
     ]
     octets = bytes.fromhex(
         "37000000 02000000"
@@ -66,7 +66,7 @@ def test_packets_round_trip_and_truncate(stamps: list[Stamp], data: st.DataObjec
 
 
 def test_sample_that_is_cut_off() -> None:
-    octets = encode_notification([Stamp(1, (Sample(1, b"abcd"),))])
+    octets = encode_notification([Stamp(1, (NotificationSample(1, b"abcd"),))])
     with pytest.raises(TruncatedError, match="sample of 4 bytes, but 3 follow"):
         decode_notification(octets[:-1])
 

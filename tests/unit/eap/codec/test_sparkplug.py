@@ -13,7 +13,7 @@ from eap.codec.sparkplug import (
     DataSet,
     Metric,
     MetricType,
-    Payload,
+    SparkplugPayload,
     Template,
     decode_payload,
     encode_payload,
@@ -52,7 +52,7 @@ def test_payload_is_encoded_as_by_hand():
 
 def test_payload_by_hand_is_decoded():
     bare = [METRICS[0]._replace(properties=()), *METRICS[1:]]
-    assert decode_payload(HAND_MADE) == Payload(1000, 5, bare)
+    assert decode_payload(HAND_MADE) == SparkplugPayload(1000, 5, bare)
 
 
 def test_signed_number_is_that_of_its_type():

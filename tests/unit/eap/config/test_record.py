@@ -13,9 +13,9 @@ from eap.config.record_texts import (
     AFTER_NS,
     BEFORE_NS,
     SPLIT_NS,
-    Division,
+    FileSplit,
     RecordTimes,
-    division_of,
+    split_of,
     times_of,
 )
 from tests.unit.eap.config.test_web import PLANT
@@ -93,8 +93,8 @@ def test_record_has_its_folder_beside_the_plant_file_and_ends_before_the_disk(tm
     )
     day, fault, store = result(tmp_path, text).plant.record
     assert (day.folder, fault.folder) == (str(tmp_path / "rec"), "/data")
-    assert (division_of(day), times_of(day)) == (Division(SPLIT_NS), RecordTimes())
-    assert division_of(fault) == division_of(store) == Division()
+    assert (split_of(day), times_of(day)) == (FileSplit(SPLIT_NS), RecordTimes())
+    assert split_of(fault) == split_of(store) == FileSplit()
     assert times_of(fault) == RecordTimes(BEFORE_NS, BEFORE_NS, AFTER_NS)
 
 

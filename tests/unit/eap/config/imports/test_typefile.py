@@ -4,8 +4,8 @@ from eap.config.imports.records import ImportReport
 from eap.config.imports.typefile import (
     ArrayBound,
     MemberRecord,
-    RecordKind,
     TypeFile,
+    TypeKind,
     TypeRecord,
     read_type_file,
 )
@@ -59,8 +59,8 @@ def test_tmc_types_are_read_with_sizes_and_offsets() -> None:
     assert not findings
     struct, enum, array, union, alias, extended = found.types
     assert [each.kind for each in found.types] == [
-        RecordKind.STRUCT, RecordKind.ENUM, RecordKind.ARRAY, RecordKind.UNION, RecordKind.ALIAS,
-        RecordKind.STRUCT,
+        TypeKind.STRUCT, TypeKind.ENUM, TypeKind.ARRAY, TypeKind.UNION, TypeKind.ALIAS,
+        TypeKind.STRUCT,
     ]  # fmt: skip
     assert (struct.name, struct.namespace, struct.bits, struct.pack) == ("ST_A", "Lib", 128, 8)
     assert struct.guid == "{11111111-0000-4000-8000-00000000000A}"
