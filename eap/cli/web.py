@@ -116,14 +116,17 @@ def _print_user(name: str) -> None:
 
     import msgspec
 
-    from eap.config.passwords import MAX_PASSWORD, PasswordHash
+    from eap.config.passwords import MAX_PASSWORD, MIN_PASSWORD, PasswordHash
 
     if sys.stdin.isatty():
         password = click.prompt("Password", hide_input=True, confirmation_prompt=True, err=True)
     else:
         password = sys.stdin.readline().rstrip("\n")
-    if not password or len(password.encode()) > MAX_PASSWORD:
-        raise click.UsageError(f"--password: expected 1 to {MAX_PASSWORD} bytes")
+    if len(password) < MIN_PASSWORD or len(password.encode()) > MAX_PASSWORD:
+        raise click.UsageError(
+            f"--password: the password has {len(password)} characters; expected at least"
+            f" {MIN_PASSWORD}, and at most {MAX_PASSWORD} bytes"
+        )
     found = PasswordHash.of(password, os.urandom(16))
     # JSON texts are YAML texts: a name may need quotes.
     quoted = msgspec.json.encode(name).decode()

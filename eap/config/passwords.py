@@ -8,6 +8,8 @@ from base64 import b64decode, b64encode
 from typing import NamedTuple
 
 FORM = "a hash that 'eapctl web --password NAME' prints (scrypt$N$R$P$SALT$KEY)"
+MIN_PASSWORD = 8
+"""Characters of the shortest password that a hash is made of (NIST SP 800-63B, 5.1.1.1)."""
 MAX_PASSWORD = 256
 """Bytes of the longest password; a longer one would only cost time."""
 

@@ -281,7 +281,7 @@ def test_port_in_use_is_named_in_status_and_the_plant_runs(folder: Plants, plant
 def test_password_option_prints_a_line_that_works(tmp_path: Path):
     done = subprocess.run(
         [*EAPCTL, "web", "--password", "an na"],
-        input="secret\n",
+        input="a good secret\n",
         capture_output=True,
         text=True,
         check=False,

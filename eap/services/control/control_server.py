@@ -179,6 +179,7 @@ def _shortened(value: Any) -> Any:
     return value if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"
 
 
+_FIRST_REQUEST_S = 1.0
 LIMITS = ListenerLimits(total=MAX_CLIENTS, reserved=0, per_host=MAX_CLIENTS)
 
 logger = logging.getLogger(__name__)
@@ -250,7 +251,7 @@ class ControlServer:
             # The user database may be on the network; few clients need it.
             peer = self._roles.own_peer(sock) or await asyncio.to_thread(self._roles.identify, sock)
             if peer is None:
-                self._refuse_peer(sock, writer)
+                await self._refuse_peer(sock, reader, writer)
                 return
             record = self._record and partial(self._record, peer.text)
             announce = self._announce and partial(self._announce, peer.text)
@@ -272,10 +273,17 @@ class ControlServer:
             # Not close(): it would wait for a client that does not read.
             transport.abort()
 
-    def _refuse_peer(self, sock: socket.socket, writer: asyncio.StreamWriter) -> None:
+    async def _refuse_peer(
+        self, sock: socket.socket, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        """Answer the first request of a client without a role."""
+        line = b""
+        with suppress(TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            async with asyncio.timeout(_FIRST_REQUEST_S):
+                line = await reader.readuntil(b"\n")
         pid, uid = process_of(sock)
         why = f"user {uid} of this host has no role in the plant file"
-        writer.write(encode_error(None, ControlError(why, code=ErrorCode.REFUSED)))
+        writer.write(encode_error(request_id(line), ControlError(why, code=ErrorCode.REFUSED)))
         if self._record is not None:
             self._record(f"uid {uid}, pid {pid}", "", {"operation": "connect", "error": why})
 

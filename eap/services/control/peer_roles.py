@@ -31,7 +31,9 @@ _FOR_VIEWERS = frozenset(
         *("log_levels", "field_points", "bus_describe", "bus_open", "bus_close"),
     )
 )
-"""Methods that change nothing; bus_ask and ams_ask depend on their parameters."""
+"""Methods that change nothing."""
+_BY_PARAMETERS = frozenset(("bus_ask", "bus_transfer"))
+"""Methods that read or change; so does ams_ask, of which the audit has the ADS request."""
 
 
 class ControlPeer(NamedTuple):
@@ -121,7 +123,7 @@ def _needed_role(request: Request, is_change: Callable[[], bool]) -> Role:
         return Role.OPERATOR
     if request.method in _FOR_VIEWERS:
         return Role.VIEWER
-    is_read = request.method == "bus_ask" and not is_change()
+    is_read = request.method in _BY_PARAMETERS and not is_change()
     return Role.VIEWER if is_read or _is_ads_read(request) else Role.ENGINEER
 
 

@@ -444,7 +444,7 @@ def test_role_of_a_client_limits_it_and_its_name_is_audited(methods, monkeypatch
             }
             assert "result" in await talk.ask("hello")
         async with Talk(server) as talk:
-            assert "has no role" in (await talk.hear())["error"]["message"]
+            assert "has no role" in (await talk.ask("status"))["error"]["message"]
 
     asyncio.run(conversation())
     assert lines == [
