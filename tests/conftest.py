@@ -87,6 +87,12 @@ def _lacks_program(name: str, *, package: str) -> str | None:
     return None
 
 
+def _lacks_browser() -> str | None:
+    if shutil.which("chromium"):
+        return None
+    return _lacks_program("chromium-headless-shell", package="chromium-headless-shell")
+
+
 def _lacks_module(name: str, *, package: str) -> str | None:
     if importlib.util.find_spec(name) is None:
         return f"needs {name}; to install: pip install {package}"
@@ -147,8 +153,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         or _lacks_program("mosquitto_sub", package="mosquitto-clients")
         or _lacks_program("openssl", package="openssl"),
         "prometheus": _lacks_program("prometheus", package="prometheus"),
-        "chromium": _lacks_program("chromium", package="chromium")
-        or _lacks_module("playwright", package="playwright"),
+        "chromium": _lacks_browser() or _lacks_module("playwright", package="playwright"),
     }
     for item in items:
         for marker, reason in missing.items():

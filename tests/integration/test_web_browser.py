@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.support.appliance import EAPCTL, Appliance, Plants, SharedAppliance, plants, wait_until
-from tests.support.browser import Tab, browser
+from tests.support.browser import Tab, Tabs, browser
 from tests.support.webplant import HASH, PASSWORD
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Locator, Route
+    from playwright.sync_api import Locator, Route
 
 pytestmark = [pytest.mark.net, pytest.mark.chromium, pytest.mark.timeout(300)]
 
@@ -70,7 +70,7 @@ VIEWS = (
 
 
 @pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
+def chromium() -> Iterator[Tabs]:
     with browser() as found:
         yield found
 
@@ -97,13 +97,13 @@ def plant(demo: SharedAppliance) -> Appliance:
 
 
 @pytest.fixture
-def tab(chromium: Browser, plant: Appliance) -> Iterator[Callable[..., Tab]]:
+def tab(chromium: Tabs, plant: Appliance) -> Iterator[Callable[..., Tab]]:
     """Make tabs; in none of them may anything go wrong unless the test empties its complaints."""
     wait_for_page(plant)
     made: list[Tab] = []
 
     def make(**context: Any) -> Tab:
-        made.append(Tab(chromium, URL, **context))
+        made.append(chromium.make(URL, **context))
         return made[-1]
 
     yield make
@@ -472,9 +472,7 @@ def test_table_fits_on_paper_with_the_date_and_its_values_on_phones(tab: Callabl
     assert re.fullmatch(r"20\d\d-\d\d-\d\d", date)
 
 
-def test_page_of_a_plant_that_does_not_run_says_so(
-    folder: Plants, chromium: Browser, tmp_path: Path
-):
+def test_page_of_a_plant_that_does_not_run_says_so(folder: Plants, chromium: Tabs, tmp_path: Path):
     path = folder.write((CONFIG / "solar-line.yaml").read_text(), "asleep.yaml")
     command = [*EAPCTL, "web", str(path), "--listen", "127.9.62.7:8080"]
     environment = os.environ | {"EAP_RUNTIME_DIR": str(tmp_path), "EAP_STATE_DIR": str(tmp_path)}
@@ -482,7 +480,7 @@ def test_page_of_a_plant_that_does_not_run_says_so(
     try:
         assert server.stderr is not None
         assert "http://127.9.62.7:8080/" in server.stderr.readline()
-        one = Tab(chromium, "http://127.9.62.7:8080")
+        one = chromium.make("http://127.9.62.7:8080")
         page = one.open("plant/")
         page.get_by_text("No station answers.").wait_for()
         assert one.complaints == []
@@ -492,13 +490,13 @@ def test_page_of_a_plant_that_does_not_run_says_so(
         server.communicate()
 
 
-def test_default_pages_of_the_solar_line(folder: Plants, plant: Appliance, chromium: Browser):
+def test_default_pages_of_the_solar_line(folder: Plants, plant: Appliance, chromium: Tabs):
     plant.stop()  # it has the same addresses
     text = (CONFIG / "solar-line.yaml").read_text()
     path = folder.write(f"{text}\nweb: 127.9.62.8:8080\n", "solar-line.yaml")
     line = folder.run(path)
     wait_for_page(line)
-    one = Tab(chromium, "http://127.9.62.8:8080")
+    one = chromium.make("http://127.9.62.8:8080")
     page = one.open()
     page.get_by_role("heading", level=1, name="solar-line").wait_for()
     page.locator(".node").nth(14).wait_for()
