@@ -79,7 +79,8 @@ class Sample(NamedTuple):
     """Value of a variable.
 
     Attributes:
-        value: As in the control protocol: bool, int, float, str, list, or dict of a struct.
+        value: As in the control protocol: bool, int, float, str, list, or dict of a struct; None
+            for a number that JSON cannot carry.
         quality: Its quality.
         time_ns: Unix time at which its data was made: of the cycle, less the age of received data.
     """
@@ -87,6 +88,11 @@ class Sample(NamedTuple):
     value: Any
     quality: Quality
     time_ns: int
+
+    @property
+    def has_value(self) -> bool:
+        """False if there is nothing to pass on; null alone is a number that JSON cannot carry."""
+        return self.value is not None or self.quality is not Quality.BAD
 
 
 def select(

@@ -11,8 +11,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from functools import lru_cache
-from math import isfinite
-from typing import NamedTuple, NoReturn, Protocol
+from math import isfinite, nan
+from typing import Any, NamedTuple, NoReturn, Protocol
 
 import msgspec
 
@@ -450,6 +450,15 @@ def is_finite(value: Value) -> bool:
     if isinstance(value, tuple):
         return all(map(is_finite, value))
     return not isinstance(value, float) or isfinite(value)
+
+
+def with_nan(plain: Any) -> Any:
+    """Return a plain value with NaN for each null: JSON can carry neither NaN nor infinities."""
+    if plain is None:
+        return nan
+    if isinstance(plain, dict):
+        return {name: with_nan(each) for name, each in plain.items()}
+    return [with_nan(each) for each in plain] if isinstance(plain, list) else plain
 
 
 def _whole_octet(bits: int) -> int:

@@ -307,16 +307,25 @@ _DATE_1990 = date(1990, 1, 1).toordinal() - _EPOCH
 _S5_BASES_MS = (10, 100, 1_000, 10_000)
 
 
-def _counted(code: str, tick_ns: int, first: int = 0) -> tuple[Any, Any]:
-    """Return the conversions of a count of ticks that begins with *first*."""
+def _counted(code: str, tick_ns: int) -> tuple[Any, Any]:
+    """Return the conversions of a count of ticks."""
 
     def to_bytes(ns: int) -> bytes:
-        return struct.pack(code, ns // tick_ns - first)
+        return struct.pack(code, ns // tick_ns)
 
     def to_ns(data: bytes) -> int:
-        return int((struct.unpack(code, data)[0] + first) * tick_ns)
+        return int(struct.unpack(code, data)[0] * tick_ns)
 
     return to_bytes, to_ns
+
+
+def _date_bytes(ns: int) -> bytes:
+    # The zeros of a variable that has no date yet are those of S7.
+    return struct.pack(">H", ns // _DAY - _DATE_1990 if ns else 0)
+
+
+def _date_ns(data: bytes) -> int:
+    return (int.from_bytes(data, "big") + _DATE_1990) * _DAY
 
 
 def _dtl_bytes(ns: int) -> bytes:
@@ -345,7 +354,7 @@ def _from_bcd(octet: int) -> int:
 
 
 def _dt_bytes(ns: int) -> bytes:
-    day = date.fromordinal(_EPOCH + ns // _DAY)
+    day = date.fromordinal(_EPOCH + (ns // _DAY if ns else _DATE_1990))
     if not 1990 <= day.year < 2090:
         raise OverflowError
     seconds, rest = divmod(ns % _DAY, _S)
@@ -397,7 +406,7 @@ _S7_TIMES = {
     "S5TIME": _S7Time(Duration, 2, (_s5_bytes, _s5_ns)),
     "TOD": _S7Time(TimeOfDay, 4, _counted(">I", _MS)),
     "LTOD": _S7Time(TimeOfDay, 8, _counted(">Q", 1)),
-    "DATE": _S7Time(CalendarDate, 2, _counted(">H", _DAY, _DATE_1990)),
+    "DATE": _S7Time(CalendarDate, 2, (_date_bytes, _date_ns)),
     "DTL": _S7Time(DateAndTime, 12, (_dtl_bytes, _dtl_ns)),
     "DATE_AND_TIME": _S7Time(DateAndTime, 8, (_dt_bytes, _dt_ns)),
     "LDT": _S7Time(DateAndTime, 8, _counted(">q", 1)),

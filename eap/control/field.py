@@ -42,7 +42,8 @@ class FillParameters(Parameters, frozen=True):
     """``fill``: values that were just read, all of them or none."""
 
     station: str
-    values: dict[str, Plain]
+    values: dict[str, Plain | None]
+    """In plain form; null is NaN."""
 
 
 FIELD_POINTS = Method("field_points", FieldPointsParameters, list[FieldPointRow])

@@ -12,6 +12,7 @@ from typing import Any
 
 from eap.codec import datatypes
 from eap.codec.basetypes import DataType
+from eap.codec.datatypes import with_nan
 from eap.codec.structures import complete, find_variable
 from eap.pd.spec import FieldSource, StationSpec, Substitute, VariableSpec
 
@@ -94,7 +95,7 @@ class FieldSources:
         values = {}
         for name, value in plain.items():
             try:
-                values[name] = self._filled[name].kind.from_plain(value)
+                values[name] = self._filled[name].kind.from_plain(with_nan(value))
             except ValueError as exc:
                 raise ValueError(f"{name}: {exc}") from None
         for name in values:

@@ -10,6 +10,7 @@ import subprocess
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -195,6 +196,23 @@ def test_values_of_snap7_reach_the_station(plant: Appliance) -> None:
     assert values["press.ok"] is False
     wanted = f"1 of 6 values fail: {found['reason']}"
     assert wanted in {row["what"] for row in plant.status()["findings"]}
+
+
+def test_number_that_is_none_reaches_the_station_beside_the_others(
+    plant: Appliance, press: Press
+) -> None:
+    wait_until(lambda: plant.values("mill")["temp"] == 21.5)
+    struct.pack_into(">f", press.db1, 4, nan)
+    press.db1[0] = 0
+    try:
+        # JSON shows NaN as null.
+        wait_until(lambda: plant.values("mill")["temp"] is None)
+        wait_until(lambda: plant.values("mill")["running"] is False)
+        assert read(plant, "temp")[2] is False
+    finally:
+        struct.pack_into(">f", press.db1, 4, 21.5)
+        press.db1[0] = 8
+    wait_until(lambda: plant.values("mill")["temp"] == 21.5)
 
 
 def test_targets_reach_snap7_and_jsmodbus(plant: Appliance, press: Press) -> None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from eap.bridges.bridge import Bridge
 from eap.bridges.field.link import FieldConversation, FieldLink, FieldLinkError, ResultT
 from eap.bridges.field.plan import PointKey, ReadPlan, ReadSpan, batches, bytes_in
+from eap.codec.datatypes import with_nan
 from eap.codec.fieldaddresses import FieldPoint
 from eap.config.field_sections import ControllerSection
 from eap.control.field import FILL
@@ -140,7 +141,7 @@ class FieldClient:
                 key, plain = next(iter(pending.items()))
                 point = self._points.targets[key]
                 try:
-                    data = point.type.encode(point.type.kind.from_plain(plain))
+                    data = point.type.encode(point.type.kind.from_plain(with_nan(plain)))
                 except ValueError as exc:
                     self._failures[key] = f"{key.variable}: {exc}"
                 else:

@@ -4,6 +4,7 @@ Rule 1: a read shows variables as they are now, zeros between them, and ends bef
 behind the last variable of the area.
 Rule 2: a write is done as a whole or refused as a whole.  It may cover variables that clients must
 not write, and gaps, as long as it leaves them as they are: panels write whole blocks.
+A variable that holds NaN is left as it is by a write that leaves it.
 Rule 3: of a variable that a write covers in part the other bytes keep their values.
 """
 
@@ -14,6 +15,7 @@ from collections.abc import Iterable
 from enum import Enum
 from typing import Any, NamedTuple
 
+from eap.codec.datatypes import is_finite, with_nan
 from eap.codec.fieldaddresses import FieldPoint, place_text, unit_bits
 from eap.codec.fieldtypes import get_bits, put_bits
 
@@ -96,7 +98,7 @@ class ServedMemory:
         """Show a new value; return why that is not possible, and it keeps the one before."""
         for _, point, _ in self._by_name.get(name, ()):
             try:
-                data = point.type.encode(point.type.kind.from_plain(plain))
+                data = point.type.encode(point.type.kind.from_plain(with_nan(plain)))
             except ValueError as exc:
                 return f"{name}: {exc}"
             put_bits(self._areas[point.place.area].data, point.place.bit, point.type.bits, data)
@@ -134,9 +136,14 @@ class ServedMemory:
             if is_writable:
                 # Also one with the same value: somebody else may have set another one meanwhile.
                 try:
-                    changes[name] = kind.kind.to_plain(kind.decode(after))
+                    value = kind.decode(after)
                 except ValueError as exc:
                     raise DeniedError(Denial.VALUE, f"{name}: {exc}") from None
+                if is_finite(value):
+                    changes[name] = kind.kind.to_plain(value)
+                elif before != after:
+                    why = f"{name}: clients write neither NaN nor infinite numbers"
+                    raise DeniedError(Denial.VALUE, why)
             elif before != after:
                 why = f"{name} at {place_text(point)} is not writable"
                 raise DeniedError(Denial.READ_ONLY, why)

@@ -124,7 +124,7 @@ async def _run(
 
     def pass_on(samples: Mapping[str, Sample]) -> None:
         for name, sample in samples.items():
-            for client, point in targets.get(name, ()):
+            for client, point in targets.get(name, ()) if sample.has_value else ():
                 client.set(point, sample.value)
 
     async with asyncio.TaskGroup() as group:

@@ -12,7 +12,7 @@ from ipaddress import ip_address
 from typing import Any, Literal
 
 from eap.bridges.bridge import Bridge
-from eap.bridges.feed import Quality, Sample
+from eap.bridges.feed import Sample
 from eap.bridges.field.memory import ServedMemory, ServedPoint
 from eap.bridges.field.session import FieldSession
 from eap.config.field import served_point
@@ -106,7 +106,7 @@ class FieldServing:
 
     def _show(self, samples: Mapping[str, Sample]) -> None:
         for name, sample in samples.items():
-            if sample.quality is Quality.BAD and sample.value is None:
+            if not sample.has_value:
                 continue
             self._bridge.status.sent += 1
             why = self.memory.update(name, sample.value)

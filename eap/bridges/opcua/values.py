@@ -20,7 +20,7 @@ from eap.codec.arrays import Array
 from eap.codec.basetypes import Block, Boolean, DataType, Integer, Plain, Real
 from eap.codec.enumerations import Enumeration
 from eap.codec.structures import Structure
-from eap.codec.times import CalendarDate, DateAndTime, Timed
+from eap.codec.times import CalendarDate, DateAndTime, Timed, TimeOfDay
 
 DURATION = 290
 """Data type Duration: milliseconds as a Double."""
@@ -31,6 +31,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _EPOCH_TICKS = 116_444_736_000_000_000
 """Units of 100 ns from 1601, where DateTime begins, to 1970."""
 _MS, _TICK = 1_000_000, 100
+_DAY = 86_400_000 * _MS
 
 
 class BuiltIn(IntEnum):
@@ -216,7 +217,8 @@ def _time(kind: Timed) -> Converter:
 
     def text(ns: int) -> Plain:
         number = ns // kind.tick_ns
-        if ns < 0 or number >> kind.bit_length:
+        is_late = isinstance(kind, TimeOfDay) and ns >= _DAY
+        if ns < 0 or number >> kind.bit_length or is_late:
             raise ValueError(f"{ns} ns are no {kind.name}")
         return kind.to_plain(kind.decode(number.to_bytes(kind.size, "little"), 0))
 

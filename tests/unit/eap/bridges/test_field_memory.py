@@ -111,6 +111,19 @@ def test_value_that_does_not_fit_its_address_keeps_the_one_before() -> None:
     assert memory.read("DB1", 0, 16) == b"\0\7"
 
 
+def test_number_that_json_cannot_carry_is_shown_as_nan_and_not_written() -> None:
+    memory = block()
+    assert memory.update("m/speed", None) == ""  # as the control protocol shows NaN and infinities
+    assert memory.update("m/setpoint", None) == ""
+    assert memory.read("DB1", 16, 32).hex() == "7fc00000"
+    # A panel that writes the whole block back leaves it.
+    assert write(memory, 0, memory.read("DB1", 0, 8 * 18).hex()) == {"m/on": False, "m/name": "ab"}
+    for number in ("7fc00001", "7f800000"):
+        with pytest.raises(DeniedError, match="m/setpoint: clients write neither NaN") as caught:
+            write(memory, 8, number)
+        assert caught.value.denial is Denial.VALUE
+
+
 def test_coils_and_bits_of_registers() -> None:
     memory = ServedMemory(
         [

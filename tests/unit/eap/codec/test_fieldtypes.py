@@ -90,6 +90,19 @@ def test_s7_value_has_the_bytes_of_the_manual(
         assert again == kind.to_plain(value_of(kind, plain))
 
 
+@pytest.mark.parametrize(
+    ("text", "other", "octets"),
+    [("DATE", "", "0000"), ("LDATE", "", "0000"), ("DT", "DATE_AND_TIME", "9001010000000002")],
+)
+def test_date_that_was_never_set_is_the_first_one_of_s7(text: str, other: str, octets: str) -> None:
+    kind = datatypes.parse(text)
+    field = s7_type(kind, other)
+    assert field.encode(kind.zero).hex() == octets
+    assert "1990-01-01" in str(kind.to_plain(field.decode(bytes.fromhex(octets))))
+    with pytest.raises(ValueError, match="out of range"):
+        field.encode(kind.from_plain(str(kind.to_plain(kind.zero)).replace("1970", "1989")))
+
+
 @pytest.mark.parametrize(("text", "other", "plain", "octets"), MODBUS)
 def test_register_value_has_its_bytes(text: str, other: str, plain: Any, octets: str) -> None:
     kind = datatypes.parse(text)

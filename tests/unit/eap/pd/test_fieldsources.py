@@ -1,5 +1,7 @@
 """Sources in controllers: time-outs, substitutes, states, and the quality of frames with them."""
 
+from math import isnan
+
 import msgspec
 import pytest
 
@@ -74,6 +76,12 @@ def test_wrong_value_is_refused_and_nothing_taken() -> None:
         sources.fill({"held": 1.0, "zeroed": "x"}, 5)
     assert sources.moments()["held"] == 0
     assert sources.unknown(["held", "copy"]) == ["copy"]
+
+
+def test_null_is_nan_and_disturbs_no_other_value() -> None:
+    filled = FieldSources(STATION).fill(READ | {"held": None}, 5)
+    assert isnan(filled["held"])
+    assert filled["zeroed"] == 6.0
 
 
 def test_changed_station_keeps_the_ages_of_sources_that_stay() -> None:

@@ -136,7 +136,8 @@ def test_plain_value_of_another_type_is_refused(text, plain):
     ("text", "value"),
     [
         ("REAL", math.inf), ("LREAL", math.nan), ("UINT", -1), ("TIME", -1.0), ("TIME", math.inf),
-        ("TIME", 1e20), ("DT", datetime(1969, 1, 1, tzinfo=UTC)), ("BLOCK(2)", b"abc"),
+        ("TIME", 1e20), ("TOD", 86_400_000.0), ("DT", datetime(1969, 1, 1, tzinfo=UTC)),
+        ("BLOCK(2)", b"abc"),
         ("INT[3]", [1, 2]), ("INT[2,2]", [1, 2, 3, 4]), ("INT[2]", None), (AXIS, ENCODED + b"x"),
         (AXIS, ENCODED[:-1]), (AXIS, b""),
     ],
