@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from eap.config.record_sections import RecordKind, RecordSection
+from eap.patterns import compile_patterns
 from eap.quantities import duration
 
 DAY_NS = 86_400 * 10**9
@@ -148,11 +149,5 @@ def matcher(patterns: Iterable[str]) -> Callable[[str], bool]:
 
     A pattern is ``STATION`` or ``STATION/NAME``; ``*`` stands for any text, ``?`` for a character.
     """
-    parts = [_expression(each if "/" in each else f"{each}/*") for each in patterns]
-    found = re.compile("|".join(parts) if parts else ".*", re.DOTALL)
-    return lambda name: found.fullmatch(name) is not None
-
-
-def _expression(pattern: str) -> str:
-    signs = {"*": ".*", "?": "."}
-    return "".join(signs.get(each) or re.escape(each) for each in pattern)
+    texts = [each if "/" in each else f"{each}/*" for each in patterns]
+    return compile_patterns(texts or ["*"])

@@ -8,6 +8,7 @@ from eap.codec.structures import variable_of
 from eap.config.finding import FindingReport, one_beside, one_of
 from eap.config.index import Index
 from eap.config.structs import StationSection
+from eap.patterns import compile_patterns
 from eap.pd.rules import MADE_SUFFIXES
 from eap.suggest import suggest
 
@@ -18,32 +19,8 @@ def match_names(pattern: str, names: Iterable[str]) -> list[str]:
     """Return the *names* that fit *pattern*; ``*`` stands for any text without slashes."""
     if "*" not in pattern:
         return [name for name in names if name == pattern]
-    segments = [segment.split("*") for segment in pattern.split("/")]
-    return [name for name in names if _fits(name.split("/"), segments)]
-
-
-def _fits(parts: list[str], segments: list[list[str]]) -> bool:
-    return len(parts) == len(segments) and all(map(_fits_pieces, parts, segments))
-
-
-def _fits_pieces(text: str, pieces: list[str]) -> bool:
-    """Return whether *pieces* are in *text* in their order, with any text between them.
-
-    Each piece is taken at its first place.  A regular expression would try all places of all
-    pieces: for a pattern with many asterisks, which clients may send, longer than any process runs.
-    """
-    if len(pieces) == 1:
-        return text == pieces[0]
-    first, *middle, last = pieces
-    at, end = len(first), len(text) - len(last)
-    if at > end or not text.startswith(first) or not text.endswith(last):
-        return False
-    for piece in middle:
-        found = text.find(piece, at, end)
-        if found < 0:
-            return False
-        at = found + len(piece)
-    return True
+    fits = compile_patterns([pattern], "[^/]")
+    return [name for name in names if fits(name)]
 
 
 class VariableNames:

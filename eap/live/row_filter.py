@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from eap.patterns import compile_patterns
 from eap.suggest import suggest
 
 _OPERATORS: dict[str, Callable[[Any, Any], bool]] = {
@@ -42,12 +43,12 @@ class _Condition(NamedTuple):
     key: str
     operator: str
     number: float | None
-    text: str
+    fits: Callable[[str], bool] | None
 
     def holds(self, row: msgspec.Struct) -> bool:
         value = getattr(row, self.key, None)
-        if isinstance(value, str):
-            is_equal = _fits(self.text, value)
+        if isinstance(value, str) and self.fits is not None:
+            is_equal = self.fits(value.casefold())
             return is_equal if self.operator in {"=", "=="} else not is_equal
         if value is None or self.number is None:
             return False
@@ -105,7 +106,7 @@ def _condition(key: str, sign: str, value: str, fields: dict[str, bool]) -> _Con
     if fields[name]:
         if sign not in {"=", "==", "!="}:
             raise ValueError(f"{key} is a text: compare it by = or !=")
-        return _Condition(name, sign, None, value)
+        return _Condition(name, sign, None, compile_patterns([value.casefold()]))
     if (found := _QUANTITY.fullmatch(value)) is None or (found[2] and not name.endswith("_us")):
         unit = ", with us, ms or s" if name.endswith("_us") else ""
         raise ValueError(f"{key}{sign}{value}: expected a number{unit}")
@@ -113,13 +114,7 @@ def _condition(key: str, sign: str, value: str, fields: dict[str, bool]) -> _Con
         number = float(found[1]) * _UNITS_US.get(found[2], 1)
     except ValueError:
         raise ValueError(f"{key}{sign}{value}: expected a number") from None
-    return _Condition(name, sign, number, "")
-
-
-def _fits(pattern: str, text: str) -> bool:
-    """Return whether *text* is like *pattern*, in which ``*`` is any text."""
-    parts = map(re.escape, pattern.casefold().split("*"))
-    return re.fullmatch(".*".join(parts), text.casefold()) is not None
+    return _Condition(name, sign, number, None)
 
 
 def _listed(known: Iterable[str]) -> str:
