@@ -10,6 +10,7 @@ from typing import Any
 from eap.control.protocol import AnswerT, ErrorCode, Method, ParametersT, ValuesEvent
 from eap.errors import ControlError
 from eap.live.transport import PlantConnection, ValuesSubscription, gone
+from eap.net.reconnecting import Backoff
 
 TIMEOUT_S = 5.0
 """Time for one answer: services may be restarting."""
@@ -69,7 +70,7 @@ class LiveClient:
         While the appliance does not answer, and while a value cannot be read, an error is yielded
         once for each attempt; after a new connection the first event has all values again.
         """
-        pause_s = _FIRST_PAUSE_S
+        backoff = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
         while True:
             connection: PlantConnection | None = None
             try:
@@ -77,14 +78,13 @@ class LiveClient:
                 async with aclosing(connection.watch(wanted)) as events:
                     async for event in events:
                         if isinstance(event, ValuesEvent):
-                            pause_s = _FIRST_PAUSE_S
+                            backoff.reset()
                         yield event
             except ControlError as exc:
                 if exc.code == ErrorCode.UNAVAILABLE:
                     await self._drop(connection)
                 yield exc
-            await asyncio.sleep(pause_s)
-            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+            await asyncio.sleep(backoff.next_s())
 
     async def close(self) -> None:
         """Close the connection; the next request opens another one."""
