@@ -1,4 +1,4 @@
-"""Quantities in words: durations, numbers of things and times, and the quality of a PD."""
+"""Quantities in words: durations, sizes, numbers of things and times, and the quality of a PD."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ QUALITY_MAX = 0xFFFF
 """Saturation value of a quality: 6.5535 s."""
 
 
-def duration(us: int) -> str:
-    """Return microseconds in the unit that keeps the number short."""
+def duration(us: int | None) -> str:
+    """Return microseconds in the unit that keeps the number short; empty if they are unknown."""
+    if us is None:
+        return ""
     if us < 1000:
         return f"{us} µs" if us else "0"
     if us < 1_000_000:
@@ -20,9 +22,22 @@ def duration(us: int) -> str:
 
 def quality(units: int | None) -> str:
     """Return a quality (in units of 100 us) as a time; empty while nothing was received."""
-    if units is None:
-        return ""
-    return "> 6.5 s" if units == QUALITY_MAX else duration(units * 100)
+    if units == QUALITY_MAX:
+        return "> 6.5 s"
+    return duration(None if units is None else units * 100)
+
+
+def age(at_s: float, now_s: float) -> str:
+    """Return the time from *at_s* to *now_s*, none if clocks differ, as a duration."""
+    return duration(max(0, round((now_s - at_s) * 1e6)))
+
+
+def size(number: int) -> str:
+    """Return a number of bytes in the decimal unit that keeps it short."""
+    for unit, bytes_of_unit in (("GB", 10**9), ("MB", 10**6), ("kB", 1000)):
+        if number >= bytes_of_unit:
+            return f"{number / bytes_of_unit:.1f} {unit}"
+    return count(number, "byte")
 
 
 def times(count: int) -> str:

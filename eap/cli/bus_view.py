@@ -28,7 +28,7 @@ from eap.ops.bus_objects import (
     SlaveObject,
 )
 from eap.ops.od import OdObjectRow
-from eap.quantities import count, duration
+from eap.quantities import age, count, duration
 from eap.runtime.bus_status import FindingRow
 from eap.runtime.engine_messages import EoeReport, LockState
 
@@ -190,7 +190,7 @@ def _emergency_table(
         first = (f"{row.address} {row.name}", str(row.emergencies))
         newest = row.latest_emergencies[::-1]
         for each in newest if is_full else newest[:_SHOWN_EMERGENCIES]:
-            ago = "" if each.time is None else _ago(each.time, now_s)
+            ago = "" if each.time is None else age(each.time, now_s)
             by = f"{each.protocol} drive {each.drive}" if each.drive else each.protocol
             code, register = f"0x{each.code:04X}", f"0x{each.register:02X}"
             table.add_row(*first, ago, by, code, each.text, register, each.data)
@@ -223,16 +223,12 @@ def eoe_table(report: EoeReport) -> TextTable:
 def finding_line(row: FindingRow, now_s: float) -> str:
     """Return one finding as a line: the fault, since or until when, and the remedy."""
     if not row.is_over:
-        since = "" if row.since is None else f"since {_ago(row.since, now_s)} ago: "
+        since = "" if row.since is None else f"since {age(row.since, now_s)} ago: "
         return f"{since}{row.what}" + (f"; {row.advice}" if row.advice else "")
     until = "before the master started"
     if row.until is not None:
-        until = f"until {_ago(row.until, now_s)} ago"
+        until = f"until {age(row.until, now_s)} ago"
     return f"was, {until}: {row.what}; --reset clears this"
-
-
-def _ago(at_s: float, now_s: float) -> str:
-    return duration(max(0, round((now_s - at_s) * 1e6)))
 
 
 def _has_errors(slave: DiagnosedSlave) -> bool:

@@ -62,7 +62,7 @@ def pd_table(rows: Sequence[DiscoveredPd]) -> TextTable:
             str(row.length),
             rate(row.rate_hz),
             trigger_text(row),
-            "" if row.jitter_us is None else duration(row.jitter_us),
+            duration(row.jitter_us),
             destination_text(row),
             *([row.name or ""] if has_names else []),
             row.taken_by or Styled("none", style="yellow"),

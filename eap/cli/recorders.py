@@ -12,7 +12,7 @@ import click
 from eap.cli.completion import complete_variables
 from eap.cli.output import Column, Renderer, TextTable
 from eap.cli.params import examples, json_option, plant_option
-from eap.quantities import count, duration
+from eap.quantities import age, count, size
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -302,9 +302,9 @@ def _table(states: Iterable[RecordingState]) -> Iterator[RenderableType]:
             state.state,
             state.plant,
             state.kind,
-            duration(int(max(0.0, until - state.started_at) * 1e6)),
+            age(state.started_at, until),
             str(state.messages),
-            _size(state.octets),
+            size(state.octets),
             str(state.lost + state.not_stored),
             state.files[-1] if state.files else state.options.get("to", ""),
         )
@@ -315,12 +315,3 @@ def _table(states: Iterable[RecordingState]) -> Iterator[RenderableType]:
         if state.ring_s is not None and not state.is_over:
             cut = ", all that fits into its memory" if state.ring_is_cut else ""
             yield f"{state.name}: {state.ring_s:g} s in memory{cut}; triggered {state.triggers}"
-
-
-def _size(octets: int) -> str:
-    if octets < 1000:
-        return f"{octets} B"
-    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if octets >= size:
-            return f"{octets / size:.1f} {unit}"
-    return ""

@@ -10,7 +10,7 @@ import click
 
 from eap.cli.output import Column, Renderer, TextTable, write_text
 from eap.cli.params import PLANT_FILE, examples, json_option
-from eap.quantities import count
+from eap.quantities import count, size
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -134,7 +134,7 @@ def _export_text(result: ExportResult) -> str:
 
 def info_view(found: RecordingInfo) -> Iterator[RenderableType]:
     """Yield the facts, then variables and events."""
-    yield f"{found.file}: {found.kind} of {found.plant or 'an unknown plant'}, {_size(found.bytes)}"
+    yield f"{found.file}: {found.kind} of {found.plant or 'an unknown plant'}, {size(found.bytes)}"
     if found.from_ is not None:
         yield f"{found.from_} to {found.until}, {found.seconds:.3f} s"
     things = "frame" if found.kind == "frames" else "message"
@@ -169,11 +169,3 @@ def _condition(found: RecordingInfo) -> Iterator[str]:
 
 
 _INTERNAL = {"format", "started_ns"}
-
-
-def _size(octets: int) -> str:
-    for unit in ("bytes", "kB", "MB"):
-        if octets < 1000 or unit == "MB":
-            break
-        octets //= 1000
-    return f"{octets} {unit}"

@@ -48,7 +48,7 @@ def result_table(results: Iterable[TestedTarget]) -> Iterator[TextTable]:
         if result.hint:
             text.append(f"\n{result.hint}", style="none")
         target = f"{result.name} {result.target}".strip()
-        table.add_row(result.station, target, round_trip(result.rtt_us), text)
+        table.add_row(result.station, target, duration(result.rtt_us), text)
     yield table
 
 
@@ -97,7 +97,7 @@ def _routes(stations: Sequence[RouterRow]) -> TextTable:
         own = station.station
         for row in station.routes:
             state = Styled(row.state, style=_STYLES[row.state])
-            trip = round_trip(row.rtt_us)
+            trip = duration(row.rtt_us)
             errors = Styled(str(row.errors), style="red" if row.errors else "")
             table.add_row(
                 own, row.name, row.pattern, transport_of(row), row.address, state, trip,
@@ -125,7 +125,7 @@ def _connections(stations: Sequence[RouterRow]) -> TextTable:
         for row in station.connections:
             table.add_row(
                 own, row.address, transport_of(row), "\n".join(row.net_ids),
-                age(row.since_s), str(row.requests),
+                elapsed(row.since_s), str(row.requests),
                 octets_of(row), str(row.errors),
             )  # fmt: skip
             own = ""
@@ -134,7 +134,7 @@ def _connections(stations: Sequence[RouterRow]) -> TextTable:
 
 def _remarks(station: RouterRow) -> Iterator[str]:
     for each in station.interruptions:
-        yield f"{interruption_text(each)}, for {age(each.since_s)}"
+        yield f"{interruption_text(each)}, for {elapsed(each.since_s)}"
     yield from station.warnings
     yield from _dead_hops(station.routes)
     for row in station.routes:
@@ -188,17 +188,12 @@ def path_of(row: EndpointRow) -> str:
 
 def last_error(row: EndpointRow) -> str:
     """Return the latest error with its age."""
-    ago = "" if row.last_error_s is None else f", {age(row.last_error_s)} ago"
+    ago = "" if row.last_error_s is None else f", {elapsed(row.last_error_s)} ago"
     return f"last error{ago}: {row.last_error}"
 
 
-def round_trip(us: int | None) -> str:
-    """Return a time, or nothing while it is not known."""
-    return "" if us is None else duration(us)
-
-
-def age(seconds: int) -> str:
-    """Return an age."""
+def elapsed(seconds: int) -> str:
+    """Return a time in whole seconds, or in the unit that keeps it short."""
     return f"{seconds} s" if seconds < 120 else duration(seconds * 1_000_000)
 
 
@@ -210,7 +205,7 @@ def route_kind(row: RouteRow) -> str:
         f"real NetID {row.real}": bool(row.real),
         f"answers within {row.timeout_ms} ms": bool(row.timeout_ms),
     }
-    ends = "" if row.expires_s is None else f"ends in {age(row.expires_s)}"
+    ends = "" if row.expires_s is None else f"ends in {elapsed(row.expires_s)}"
     return ", ".join(
         filter(None, [row.origin, ends, *(word for word, is_so in marks.items() if is_so)])
     )
@@ -218,7 +213,7 @@ def route_kind(row: RouteRow) -> str:
 
 def route_state(row: RouteRow) -> str:
     """Return the state of a route with its cause or the round-trip time of its next hop."""
-    rest = row.why or (f"round trip {round_trip(row.rtt_us)}" if row.rtt_us is not None else "")
+    rest = row.why or (f"round trip {duration(row.rtt_us)}" if row.rtt_us is not None else "")
     if row.why and row.next_name not in {"", row.name}:
         rest = f"{row.next_name}: {row.why}"
     if row.state == "unknown" and not rest:
@@ -240,9 +235,7 @@ def request_line(row: RequestRow) -> str:
     at = datetime.fromtimestamp(row.at).astimezone().strftime("%H:%M:%S")
     if not row.service:
         return f"{at} {row.outcome}: {row.text}"
-    outcome = row.text or (
-        f"error 0x{row.error:x}" if row.error else round_trip(row.took_us) or "0"
-    )
+    outcome = row.text or (f"error 0x{row.error:x}" if row.error else duration(row.took_us) or "0")
     if row.outcome != "answered":
         outcome = f"{row.outcome}: {outcome}"
     return f"{at} {row.service} {row.target} < {row.source}: {outcome}"

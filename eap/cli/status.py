@@ -633,7 +633,7 @@ def _received(row: Row, state: str) -> tuple[str | Styled, ...]:
         if lost is None
         else Styled(str(lost), style=_BAD * bool(lost)),
         quality(row["quality"]),
-        "" if age is None else duration(age),
+        duration(age),
         "" if None in spread else " / ".join(map(str, spread)),
     )
 

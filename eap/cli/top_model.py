@@ -354,7 +354,7 @@ class TopModel:
         minute = self.minute((row.plant, row.name), width)
         cells = (
             row.name, row.state, _rate(row.tx_per_s), _rate(row.rx_per_s), str(row.lost),
-            str(row.late), _time(row.age_us), _time(row.jitter_p99_us), row.bus, minute,
+            str(row.late), duration(row.age_us), duration(row.jitter_p99_us), row.bus, minute,
         )  # fmt: skip
         state = _STATE_STYLES.get(row.state, "")
         is_bus_well = not row.bus or (row.bus.endswith(" OP") and _is_whole(row.bus))
@@ -399,7 +399,7 @@ def _bar(slot: Sequence[_Moment], highest: float) -> str:
 def _pd_line(row: PdFlow) -> TopLine:
     cells = (
         row.station, "←" if row.direction == "rx" else "→", row.name, row.state, _rate(row.per_s),
-        _number(row.lost), _number(row.late), _time(row.age_us), _time(row.jitter_p99_us),
+        _number(row.lost), _number(row.late), duration(row.age_us), duration(row.jitter_p99_us),
         str(row.dropped), quality(row.quality), row.port, str(row.total),
     )  # fmt: skip
     styles = [""] * len(cells)
@@ -474,7 +474,3 @@ def _short(number: float) -> str:
 
 def _number(number: int | None) -> str:
     return "" if number is None else str(number)
-
-
-def _time(us: int | None) -> str:
-    return "" if us is None else duration(us)

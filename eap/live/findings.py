@@ -18,7 +18,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
-from eap.quantities import count, duration
+from eap.quantities import age, count, duration
 from eap.quantities import times as times_of
 
 if TYPE_CHECKING:
@@ -489,4 +489,4 @@ def _moment(at_s: float, now_s: float) -> str:
     """Return a time of day and its age, with the date if it is another day."""
     at, now = (datetime.fromtimestamp(each).astimezone() for each in (at_s, now_s))
     form = "%H:%M:%S" if at.date() == now.date() else "%Y-%m-%d %H:%M:%S"
-    return f"{at.strftime(form)} ({duration(max(0, round((now_s - at_s) * 1e6)))})"
+    return f"{at.strftime(form)} ({age(at_s, now_s)})"

@@ -34,6 +34,7 @@ from eap.control.routes import (
     RouteRow,
 )
 from eap.errors import EapError
+from eap.quantities import duration
 
 PERIOD_S = 1.0
 """Period of requests."""
@@ -300,7 +301,7 @@ class RoutesScreen(Screen[None]):
         except EapError as exc:
             text = str(exc)
         else:
-            trip = f" in {routes_view.round_trip(result.rtt_us)}" if result.ok else ""
+            trip = f" in {duration(result.rtt_us)}" if result.ok else ""
             line = f"{result.target}{trip}: {result.text}"
             text = "\n".join(filter(None, [line, result.hint]))
         title = f"{router.routes.station} to {row.name}"

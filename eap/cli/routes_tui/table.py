@@ -29,6 +29,7 @@ from eap.live.ads_connection import AdsConnection, RemoteHost
 from eap.live.client import LiveClient
 from eap.ops.client import connect_station
 from eap.ops.routing import list_routes
+from eap.quantities import duration
 
 MOST = 500
 """Routes of a station that are shown; a filter finds the others."""
@@ -246,7 +247,7 @@ def _route_line(router: PlantRouter, row: RouteRow) -> Line:
     cells = (
         station, row.name, row.pattern, routes_view.transport_of(row),
         "?" if row.state == "unknown" else row.state,
-        routes_view.round_trip(row.rtt_us), routes_view.short(row.requests),
+        duration(row.rtt_us), routes_view.short(row.requests),
         routes_view.octets_of(row), routes_view.short(row.errors), row.address, row.origin,
         row.last_error,
     )  # fmt: skip
@@ -258,7 +259,7 @@ def _connection_line(router: PlantRouter, row: ConnectionRow) -> Line:
     key = f"{router.plant}/{station}/{row.transport}/{row.address}"
     cells = (
         station, row.address, routes_view.transport_of(row), " ".join(row.net_ids),
-        routes_view.age(row.since_s), routes_view.short(row.requests),
+        routes_view.elapsed(row.since_s), routes_view.short(row.requests),
         routes_view.octets_of(row), routes_view.short(row.errors), row.last_error,
     )  # fmt: skip
     return Line(key, router, row, cells, "")

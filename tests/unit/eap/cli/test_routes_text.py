@@ -22,12 +22,8 @@ def test_counts_have_five_characters(number: int, text: str) -> None:
     assert routes_view.short(number) == text
 
 
-def test_round_trips() -> None:
-    assert [routes_view.round_trip(us) for us in (None, 840, 1_200)] == ["", "840 µs", "1.2 ms"]
-
-
 def test_ages() -> None:
-    assert [routes_view.age(each) for each in (0, 119, 180, 7200)] == [
+    assert [routes_view.elapsed(each) for each in (0, 119, 180, 7200)] == [
         "0 s",
         "119 s",
         "3 min",
