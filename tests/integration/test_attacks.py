@@ -589,6 +589,32 @@ def test_other_users_of_the_host_do_what_their_role_allows(site: Site) -> None:
     assert [each["operation"] for each in lines if each.get("error")].count("stop") == 1
 
 
+CROWD = """
+import socket, sys
+held = []
+for _ in range(100):
+    held.append(socket.socket(socket.AF_UNIX))
+    held[-1].connect(sys.argv[1])
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.host_root
+def test_connections_of_other_users_leave_places_for_the_operator(site: Site) -> None:
+    path = str(site.oven.runtime / "hardened@oven" / "control")
+    with subprocess.Popen(
+        ["setpriv", "--reuid=64951", "--regid=64951", "--clear-groups",
+         "/usr/bin/python3", "-c", CROWD, path],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd="/",
+    ) as crowd:  # fmt: skip
+        assert crowd.stdout is not None
+        assert crowd.stdout.readline() == "held\n"
+        assert site.oven.station("oven")["state"] == "OP"
+        assert crowd.stdin is not None
+        crowd.stdin.close()
+
+
 @pytest.mark.host_root
 def test_other_users_of_the_host_read_no_files(site: Site) -> None:
     folder = site.oven.runtime / "hardened@oven"

@@ -8,8 +8,18 @@ import threading
 import pytest
 from msgspec.structs import replace
 
+from eap.ams.access import AccessList
 from eap.ams.routes import Origin, Route, RouteTable
-from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
+from eap.ams.spec import (
+    AccessRule,
+    HopSpec,
+    MqttSpec,
+    Role,
+    RouteSpec,
+    RoutingSpec,
+    TransportKind,
+)
+from eap.control.protocol import WriteOrigin
 from eap.errors import ControlError
 from eap.ids import Endpoint, NetId
 from eap.runtime.store import StationFile, StationStore
@@ -19,11 +29,13 @@ from eap.services.routing.station_routes import (
     MAX_ADDED,
     StationRoutes,
     access_of,
+    denial_of_write,
     make_router,
     to_endpoint,
     to_route,
 )
 from tests.support.eventually import settle
+from tests.support.routing import station
 from tests.unit.eap.conftest import eap_port, left
 
 OWN = NetId.parse("10.0.0.1.1.1")
@@ -401,3 +413,24 @@ def test_all_addresses_of_the_machine_are_those_of_a_port_at_any(monkeypatch):
     access = access_of(left(eap_port(1, interface="udp://0.0.0.0")), RoutingSpec())
     assert access.is_this_host(Endpoint("ams-tcp", "10.0.0.7:4711#1"))
     assert not access.is_this_host(Endpoint("ams-tcp", "10.0.0.8:4711#1"))
+
+
+@pytest.mark.parametrize(
+    ("origin", "reason"),
+    [
+        (WriteOrigin("", "10.0.0.5", transport="s7"), ""),
+        (WriteOrigin("", "10.0.0.6", transport="s7"), "no rule allows it, and other hosts only"),
+        (WriteOrigin("eva", "10.0.0.6", transport="web", role=Role.ENGINEER), ""),
+        (WriteOrigin("vera", "10.0.0.5", transport="web", role=Role.VIEWER), "rule viewers"),
+        (WriteOrigin("vera", "10.0.0.5", transport="opcua", role=Role.VIEWER), "rule viewers"),
+    ],
+)
+def test_denial_of_write_goes_by_the_role_of_the_user_or_of_the_address(origin, reason):
+    rules = (
+        AccessRule("panels", roles=(Role.OPERATOR,), members=("10.0.0.5/32",)),
+        AccessRule("viewers", allow=False, roles=(Role.VIEWER,)),
+    )
+    router = station("10.0.0.1.2.1")
+    router.set_access(AccessList(rules))
+    assert denial_of_write(router, origin).startswith(reason)
+    assert bool(denial_of_write(router, origin)) is bool(reason)
