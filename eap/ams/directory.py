@@ -18,6 +18,7 @@ from typing import NamedTuple
 from eap.ams.spec import DirectoryPort, DirectoryStation, HopSpec, TransportKind
 from eap.codec.ams import AMS_TCP_PORT, DEVICE_PORT, SYSTEM_PORT
 from eap.codec.ethercat import EAP_PORT
+from eap.codec.secureads import AMS_TLS_PORT
 from eap.ids import InterfaceUri, MacAddr, NetId, parse_host
 from eap.od.profiles.router9000 import ROUTER
 from eap.suggest import suggest
@@ -135,7 +136,10 @@ def _slave(owner: str, port: DirectoryPort, slave: str) -> int:
     raise ValueError(f"no slave {slave!r} behind {owner}{hint}")
 
 
-FORMS = "STATION/PORT, ams-tcp:HOST, udp:ADDRESS, tcp:ADDRESS, ethernet:MAC or mqtt:NETWORK"
+FORMS = (
+    "STATION/PORT, ams-tcp:HOST, ams-tls:HOST, udp:ADDRESS, tcp:ADDRESS, ethernet:MAC or"
+    " mqtt:NETWORK"
+)
 _IP = ("udp", "tcp")
 _ADDRESS = re.compile(r"\d+(\.\d+){3}(:\d+)?", re.ASCII)
 _MAC = re.compile(r"[0-9A-Fa-f]{2}([:-][0-9A-Fa-f]{2}){5}")
@@ -234,6 +238,12 @@ def _by_ams_tcp(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
     return HopSpec(TransportKind.AMS_TCP, "", f"{host}:{port}")
 
 
+def _by_ams_tls(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
+    del ports
+    host, port = parse_host(rest, AMS_TLS_PORT)
+    return HopSpec(TransportKind.AMS_TLS, "", f"{host}:{port}")
+
+
 def _by_udp(rest: str, ports: Sequence[DirectoryPort]) -> HopSpec:
     return HopSpec(TransportKind.UDP, _first(ports, ("udp",)), _ip_address(rest))
 
@@ -261,6 +271,7 @@ def _by_mqtt(rest: str, net_id: str, directory: Directory) -> HopSpec:
 
 _READERS: dict[str, Callable[[str, Sequence[DirectoryPort]], HopSpec]] = {
     TransportKind.AMS_TCP: _by_ams_tcp,
+    TransportKind.AMS_TLS: _by_ams_tls,
     TransportKind.UDP: _by_udp,
     TransportKind.TCP: _by_tcp,
     TransportKind.ETHERNET: _by_ethernet,

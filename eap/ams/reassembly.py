@@ -135,6 +135,72 @@ class AmsStreamDecoder:
         return OversizedPacket(header, length)
 
 
+class BareAmsDecoder:
+    """Decoder of AMS packets without a prefix, as they are inside TLS (Secure ADS).
+
+    It holds as much as :class:`AmsStreamDecoder`.
+
+    Args:
+        limit: Bytes of the longest packet that is taken.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._buffer = bytearray()
+        self._skip = 0
+
+    @property
+    def has_begun(self) -> bool:
+        """True if a packet has begun and is not complete."""
+        return bool(self._buffer) or self._skip > 0
+
+    def receive_one(self, data: bytes) -> bytes | None:
+        """Return the packet if *data* is exactly one, as usual; else append *data*."""
+        if (
+            not self._buffer
+            and not self._skip
+            and AmsHeader.SIZE <= len(data) <= self._limit
+            and data[:2] != _NO_NET_ID
+            and int.from_bytes(data[_BODY_LENGTH], "little") == len(data) - AmsHeader.SIZE
+        ):
+            return data
+        skipped = min(self._skip, len(data))
+        self._skip -= skipped
+        self._buffer += memoryview(data)[skipped:]
+        return None
+
+    def next_item(self) -> StreamItem | None:
+        """Return the next complete packet, None if there is none yet.
+
+        Raises:
+            MalformedError: this is no stream of AMS packets; nothing can be cut from it any more.
+        """
+        if len(self._buffer) < AmsHeader.SIZE:
+            return None
+        # A length in a wrong place would be read as one of gigabytes otherwise.
+        if self._buffer[:2] == _NO_NET_ID:
+            raise MalformedError(
+                "target NetID 0.0, expected a packet without the prefix of AMS/TCP",
+                layout="AmsHeader",
+            )
+        length = AmsHeader.SIZE + int.from_bytes(self._buffer[_BODY_LENGTH], "little")
+        here = min(length, len(self._buffer))
+        if length > self._limit:
+            oversized = OversizedPacket(AmsHeader.decode(self._buffer), length)
+            self._skip = length - here
+            del self._buffer[:here]
+            return oversized
+        if here < length:
+            return None
+        packet = bytes(self._buffer[:length])
+        del self._buffer[:length]
+        return packet
+
+
+_NO_NET_ID = bytes(2)
+"""First bytes of no NetID of a router, but of the prefix of AMS/TCP."""
+_BODY_LENGTH = slice(20, 24)
+"""Place of the length of the body in the AMS header."""
 FRAGMENT_TIMEOUT_NS = 2_000_000_000
 """Limit for the next fragment; the packet is dropped then."""
 MAX_PACKETS = 8

@@ -115,6 +115,10 @@ _UNREACHED: dict[str, str] = {
     TransportKind.AMS_TCP: (
         "see whether it is switched on, and listens on that TCP port (a firewall?)"
     ),
+    TransportKind.AMS_TLS: (
+        "see whether it is switched on, has Secure ADS (a firewall?), and trusts the certificate of"
+        " this station"
+    ),
     TransportKind.UDP: "see whether it is switched on, in the same network, and its station runs",
     TransportKind.TCP: "see whether its station runs, and takes connections on that port",
     TransportKind.ETHERNET: "see to the cable and the MAC address, and whether its station runs",

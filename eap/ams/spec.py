@@ -12,6 +12,7 @@ from ipaddress import IPv4Address, IPv4Network
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from eap.ids import InterfaceUri, NetId
 
@@ -33,6 +34,8 @@ class TransportKind(StrEnum):
     ETHERNET = "ethernet"
     """Type 5 by EtherType 0x88A4."""
     AMS_TCP = "ams-tcp"
+    AMS_TLS = "ams-tls"
+    """Secure ADS."""
     MQTT = "mqtt"
     LOCAL = "local"
     """Programs of this appliance."""
@@ -46,14 +49,14 @@ class TransportKind(StrEnum):
 
 IP_TRANSPORTS = frozenset(
     (
-        *(TransportKind.AMS_TCP, TransportKind.UDP, TransportKind.TCP),
+        *(TransportKind.AMS_TCP, TransportKind.AMS_TLS, TransportKind.UDP, TransportKind.TCP),
         *(TransportKind.WEB, TransportKind.OPCUA, TransportKind.S7, TransportKind.MODBUS),
     )
 )
 """Kinds of transports whose connections begin with an IPv4 address."""
 
 
-NAMED_CLIENTS = (f"{TransportKind.MQTT}:",)
+NAMED_CLIENTS = (f"{TransportKind.MQTT}:", f"{TransportKind.AMS_TLS}:")
 """Prefixes of transports that stand for clients which somebody has authenticated."""
 
 
@@ -63,15 +66,80 @@ class HopSpec(SpecStruct, frozen=True):
     Attributes:
         kind: Of the transport.
         port: The station's own EAP port that they leave by (UDP, TCP, Ethernet), or the name of
-            the network (MQTT); empty for AMS/TCP.
-        address: ``ADDRESS:PORT`` (UDP, TCP), ``HOST:PORT`` (AMS/TCP, where a host may have a
-            name), a MAC address or the NetID of the port that has it (Ethernet), or the NetID of a
-            router (MQTT).
+            the network (MQTT); empty for AMS/TCP and Secure ADS.
+        address: ``ADDRESS:PORT`` (UDP, TCP), ``HOST:PORT`` (AMS/TCP and Secure ADS, where a host
+            may have a name), a MAC address or the NetID of the port that has it (Ethernet), or the
+            NetID of a router (MQTT).
     """
 
     kind: TransportKind
     port: str
     address: str
+
+
+class PskSpec(SpecStruct, frozen=True):
+    """Pre-shared key: an identity, and the absolute path of the file with its password."""
+
+    identity: str
+    password_file: str
+
+
+class SecurePeer(SpecStruct, frozen=True):
+    """Client by Secure ADS: its name in access rules, and the fingerprint of its certificate."""
+
+    name: str
+    fingerprint: str
+
+
+class SecureAdsSpec(SpecStruct, frozen=True, kw_only=True):
+    """Secure ADS of a station; paths are absolute, files are PEM.
+
+    Attributes:
+        certificate: Of the station, with those of the authorities between it and *ca*.
+        key: Of that certificate.
+        ca: Certificates of authorities whose clients are trusted; empty for none.
+        peers: Clients that are trusted by their fingerprints, as those of routes are.
+        psk: Clients that are trusted by pre-shared keys.
+        port: TCP port of the listener; 0 for none.
+    """
+
+    certificate: str
+    key: str
+    ca: str = ""
+    peers: tuple[SecurePeer, ...] = ()
+    psk: tuple[PskSpec, ...] = ()
+    port: int = 8016
+
+
+class SecureRouteSpec(SpecStruct, frozen=True, kw_only=True):
+    """TLS of a route by Secure ADS; paths are absolute, files are PEM.
+
+    The far end is known by *psk*, else by *fingerprint*, else by an authority of *ca*.  What is
+    empty of *ca*, *certificate* and *key* is that of the station's :class:`SecureAdsSpec`.
+
+    Attributes:
+        fingerprint: SHA-256 of the certificate of the far end.
+        psk: None for certificates.
+        ca: Certificates of trusted authorities.
+        certificate: That this end shows.
+        key: Of that certificate.
+        check_name: Whether a certificate that an authority of *ca* signed has to name the host of
+            the route.
+    """
+
+    fingerprint: str = ""
+    psk: PskSpec | None = None
+    ca: str = ""
+    certificate: str = ""
+    key: str = ""
+    check_name: bool = True
+
+    def complete(self, own: SecureAdsSpec | None) -> SecureRouteSpec:
+        """Return the settings with those of the station where there are none."""
+        if own is None:
+            return self
+        certificate, key = self.certificate or own.certificate, self.key or own.key
+        return replace(self, ca=self.ca or own.ca, certificate=certificate, key=key)
 
 
 class RouteSpec(SpecStruct, frozen=True, kw_only=True):
@@ -93,6 +161,7 @@ class RouteSpec(SpecStruct, frozen=True, kw_only=True):
             which has connections of its own and does not listen.
         file_flags: ``Flags`` of the StaticRoutes file that it is from, for an export; no effect.
         file_timeout: ``Timeout`` of that file, likewise.
+        tls: None unless it goes by Secure ADS.
     """
 
     name: str
@@ -108,6 +177,7 @@ class RouteSpec(SpecStruct, frozen=True, kw_only=True):
     is_client: bool = False
     file_flags: str = ""
     file_timeout: str = ""
+    tls: SecureRouteSpec | None = None
 
 
 class AccessService(StrEnum):
@@ -187,8 +257,8 @@ class AccessRule(SpecStruct, frozen=True):
         networks: IPv4 networks that a connection comes from (``10.0.0.0/24``).
         macs: MAC addresses that frames come from on Ethernet; an address in one of the two fits.
         net_ids: Source NetIDs, by their first four, five or all six bytes; they prove nothing.
-        transports: Names (``mqtt:line``) or kinds (``ams-tcp``, ``udp``, ``tcp``, ``ethernet``,
-            ``mqtt``, ``local``, ``web``, ``opcua``, ``s7``, ``modbus``).
+        transports: Names (``mqtt:line``) or kinds (``ams-tcp``, ``ams-tls``, ``udp``, ``tcp``,
+            ``ethernet``, ``mqtt``, ``local``, ``web``, ``opcua``, ``s7``, ``modbus``).
         targets: Of the requests.
         services: Kinds of operations.
         objects: Of a dictionary; a rule that has some is about nothing else.
@@ -274,6 +344,7 @@ class RoutingSpec(SpecStruct, frozen=True, kw_only=True):
         users: May add routes by UDP 48899; without any only programs of this host may.
         learn: Sources of learned routes: ``mqtt:NETWORK``, from the infos of routers
             there, and IPv4 networks, from answers to scans; true for all, false for none.
+        secure: Secure ADS; None for none.
     """
 
     routes: tuple[RouteSpec, ...] = ()
@@ -281,6 +352,7 @@ class RoutingSpec(SpecStruct, frozen=True, kw_only=True):
     access: tuple[AccessRule, ...] = ()
     users: tuple[AmsUser, ...] = ()
     learn: bool | tuple[str, ...] = True
+    secure: SecureAdsSpec | None = None
 
     def learns_by_mqtt(self, network: str) -> bool:
         """Return whether routes are learned from the infos of an MQTT network."""
@@ -325,6 +397,9 @@ def describe_routing(old: RoutingSpec, new: RoutingSpec) -> list[str]:
     before, after = _order(old.access), _order(new.access)
     if before != after and sorted(before) == sorted(after):
         found.append("access rules: in another order")
+    if old.secure != new.secure:
+        how = "off" if new.secure is None else "on" if old.secure is None else "changed"
+        found.append(f"Secure ADS: {how}")
     if old.learn != new.learn:
         found.append(f"routes are learned from {_sources(new.learn)}")
     return found

@@ -34,6 +34,8 @@ OBJECTS = "INDEX, INDEX:SUB or FIRST-LAST in hexadecimal, such as 0x8000:01"
 # A service that is added later counts as a write, so no existing rule lets it through.
 _WRITES = tuple(each for each in AccessService if each is not AccessService.READ)
 _TOP_PORT = 0xFFFF
+_CLIENT = f"{TransportKind.AMS_TLS}:"
+"""Prefix of a client by Secure ADS."""
 _MAC_COLONS = 5
 
 
@@ -301,8 +303,13 @@ def _transports(station: StationSection) -> list[str]:
 
 
 def _check_transport(text: str, known: list[str]) -> None:
-    if text not in known:
-        expected = f"{one_of(TransportKind)}, or one transport such as udp:PORT or mqtt:NETWORK"
+    # Any certificate of an authority that the station trusts may name its client.
+    is_client = text.startswith(_CLIENT) and text != _CLIENT
+    if text not in known and not is_client:
+        expected = (
+            f"{one_of(TransportKind)}, or one transport such as udp:PORT, mqtt:NETWORK or"
+            " ams-tls:CLIENT"
+        )
         raise SectionError("", f"no transport {text!r}{suggest(text, known)}", expected)
 
 

@@ -166,6 +166,9 @@ def check_credentials(
     if route.tls is None:
         return
     at = f"{route.at}.tls"
+    for name in TlsSection.ROUTE_KEYS:
+        if getattr(route.tls, name):
+            report.add(f"{at}.{name}", f"{name} does not belong to a broker", "ca, and certificate")
     for key, file in (
         ("ca", route.tls.ca),
         ("certificate", route.tls.certificate),

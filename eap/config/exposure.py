@@ -25,6 +25,7 @@ from eap.config.structs import (
     AuditMode,
     PortSection,
     RouteSection,
+    StationSection,
 )
 from eap.config.web import parse_listen
 from eap.ids import InterfaceUri
@@ -305,6 +306,8 @@ _RULES: tuple[Callable[[Index], Iterable[Found]], ...] = (
 def _readable_files(index: Index, folder: Path) -> Iterator[tuple[str, str]]:
     """Yield the files with passwords and keys that other users of the host may read."""
     for path, name in _secret_files(index):
+        if not name:
+            continue
         try:
             mode = (folder / name).stat().st_mode
         except (OSError, ValueError):
@@ -315,20 +318,28 @@ def _readable_files(index: Index, folder: Path) -> Iterator[tuple[str, str]]:
 
 def _secret_files(index: Index) -> Iterator[tuple[str, str]]:
     for station in index.plant.stations:
-        for user in station.users:
-            if user.password_file:
-                yield f"{user.at}.password_file", user.password_file
-        for route in brokers_of(station):
-            if route.password_file:
-                yield f"{route.at}.password_file", route.password_file
-            if route.tls is not None and route.tls.key:
-                yield f"{route.at}.tls.key", route.tls.key
+        yield from _station_secrets(station)
     mqtt = index.plant.mqtt
     if mqtt is not None and mqtt.password_file:
         yield f"{mqtt.at}.password_file", mqtt.password_file
     for section in (index.plant.web, index.plant.metrics):
         if section is not None and section.tls is not None:
             yield f"{section.at}.tls.key", section.tls.key
+
+
+def _station_secrets(station: StationSection) -> Iterator[tuple[str, str]]:
+    """Yield the files with secrets of a station; some have no name."""
+    for user in station.users:
+        yield f"{user.at}.password_file", user.password_file
+    secure = station.secure_ads
+    if secure is not None:
+        yield f"{secure.at}.key", secure.key
+        yield from ((f"{secure.at}.psk.{name}", file) for name, file in secure.psk.items())
+    for route in station.routes:
+        yield f"{route.at}.password_file", route.password_file
+        if route.tls is not None:
+            yield f"{route.at}.tls.key", route.tls.key
+            yield f"{route.at}.tls.password_file", route.tls.password_file
 
 
 def _is_reached(port: PortSection) -> bool:

@@ -71,6 +71,7 @@ from eap.config.routes import (
     route_net_ids,
     stations_without_prefix,
 )
+from eap.config.secure import check_secure_ads, secure_ads_spec, secure_route_spec
 from eap.config.servers import check_servers
 from eap.config.structs import (
     ANY_SOURCE,
@@ -404,13 +405,14 @@ def derive_routing(index: Index, folder: Path) -> dict[str, RoutingSpec]:
     return {
         station.name: RoutingSpec(
             routes=(
-                *_configured_routes(index, station, shared),
+                *_configured_routes(index, station, shared, folder),
                 *_derived_routes(index, station, known),
             ),
             mqtt=tuple(broker_spec(each, folder) for each in brokers_of(station)),
             access=tuple(access_rules(index, station, shared)),
             users=tuple(AmsUser(user.name, _password_file(user, folder)) for user in station.users),
             learn=discovery_sources(station),
+            secure=secure_ads_spec(station.secure_ads, folder),
         )
         for station in index.plant.stations
     }
@@ -444,7 +446,7 @@ def derive_directory(index: Index) -> tuple[DirectoryStation, ...]:
 
 
 def _configured_routes(
-    index: Index, station: StationSection, shared: set[str]
+    index: Index, station: StationSection, shared: set[str], folder: Path
 ) -> Iterator[RouteSpec]:
     for route in station.routes:
         if route.mqtt:
@@ -461,6 +463,7 @@ def _configured_routes(
                 is_unidirectional=route.unidirectional,
                 timeout_ms=route.timeout_ms,
                 is_probed=route.probe,
+                tls=secure_route_spec(route.tls, folder),
             )
 
 
@@ -592,6 +595,7 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
     check_links(index, report)
     check_routes(index, report, path.parent)
     check_discovery(index, report)
+    check_secure_ads(index, report, path.parent)
     check_access(index, report, path.parent)
     check_plant_users(index, report)
     check_web(index, report, path.parent)

@@ -14,6 +14,7 @@ from eap.ams.routes import Route as AmsRoute
 from eap.ams.spec import DEFAULT_TARGET, HopSpec, RouteSpec, RoutingSpec, TransportKind
 from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.ethercat import EAP_PORT
+from eap.codec.secureads import AMS_TLS_PORT
 from eap.config.brokers import HOST, brokers_of, check_brokers, find_network
 from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index, is_local_only
@@ -151,17 +152,25 @@ def _by_ams_tcp(index: Index, station: StationSection, route: RouteSection) -> N
         if uri is None or uri.scheme not in {"udp", "tcp"} or not index.ports[other.name, port].ams:
             message = f"{route.ams_tcp} does not serve AMS/TCP"
             raise SectionError("ams_tcp", message, "a port on udp:// or tcp:// without ams: false")
-        return NextHop(_ams_tcp(uri.host, AMS_TCP_PORT), str(other.net_id))
+        number = AMS_TCP_PORT
+        if route.tls is not None:
+            number = other.secure_ads.port if other.secure_ads else 0
+            if not number:
+                message = f"{other.name} has no Secure ADS"
+                raise SectionError("ams_tcp", message, f"secure_ads at station {other.name}")
+        return NextHop(_ams_tcp(uri.host, number, route), str(other.net_id))
     try:
-        host, number = parse_host(route.ams_tcp, AMS_TCP_PORT)
+        usual = AMS_TCP_PORT if route.tls is None else AMS_TLS_PORT
+        host, number = parse_host(route.ams_tcp, usual)
     except ValueError as exc:
         raise SectionError("ams_tcp", f"ams_tcp: {exc}", f"{HOST}, or STATION/PORT") from None
     target = target_of(index, route)
-    return NextHop(_ams_tcp(host, number), str(target.net_id) if target else "")
+    return NextHop(_ams_tcp(host, number, route), str(target.net_id) if target else "")
 
 
-def _ams_tcp(host: str, port: int) -> HopSpec:
-    return HopSpec(TransportKind.AMS_TCP, "", f"{host}:{port}")
+def _ams_tcp(host: str, port: int, route: RouteSection) -> HopSpec:
+    kind = TransportKind.AMS_TCP if route.tls is None else TransportKind.AMS_TLS
+    return HopSpec(kind, "", f"{host}:{port}")
 
 
 def _by_mqtt(index: Index, station: StationSection, route: RouteSection) -> NextHop:
@@ -377,7 +386,7 @@ def _check_keys(route: RouteSection, report: FindingReport) -> None:
             RouteSection.ROUTE_KEYS,
         )
     for key in others:
-        if f"{route.at}.{key}" in report.lines:
+        if key not in expected and f"{route.at}.{key}" in report.lines:
             report.add(f"{route.at}.{key}", f"{key} does not belong to {what}", one_of(expected))
     if not route.to and not route.mqtt:
         report.add(route.at, "route has neither to nor mqtt", "to: STATION, or mqtt: URL")

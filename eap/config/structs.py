@@ -400,6 +400,23 @@ class TlsSection(Section, frozen=True):
     certificate: str = ""
     key: str = ""
     check_name: bool = True
+    fingerprint: str = ""
+    identity: str = ""
+    password_file: str = ""
+
+    ROUTE_KEYS: ClassVar[tuple[str, ...]] = ("fingerprint", "identity", "password_file")
+    """Keys of a route by Secure ADS that a broker has not."""
+
+
+class SecureAdsSection(Section, frozen=True):
+    """Secure ADS of a station; files by their paths from the plant file on."""
+
+    certificate: str
+    key: str
+    ca: str = ""
+    peers: dict[str, str] = {}
+    psk: dict[str, str] = {}
+    port: U16 = 8016
 
 
 class RouteSection(Section, frozen=True):
@@ -435,6 +452,7 @@ class RouteSection(Section, frozen=True):
         "virtual",
         "timeout_ms",
         "probe",
+        "tls",
     )
     MQTT_KEYS: ClassVar[tuple[str, ...]] = (
         "network",
@@ -490,6 +508,7 @@ class StationSection(Section, frozen=True):
     learn: bool | tuple[str, ...] = True
     access: tuple[AccessSection, ...] = ()
     users: tuple[UserSection, ...] = ()
+    secure_ads: SecureAdsSection | None = None
     pd_keys: str = ""
 
     @property

@@ -24,7 +24,8 @@ class PlantUserSection(AccountSection, frozen=True, kw_only=True):
     """User of the whole plant.
 
     *unix* are users of the operating system and *groups* its groups, for the control socket;
-    *networks* are IPv4 networks, MAC addresses and ``mqtt:NETWORK`` that have the role in rules.
+    *networks* are IPv4 networks, MAC addresses, ``mqtt:NETWORK`` and ``ams-tls:CLIENT`` that have
+    the role in rules.
     """
 
     unix: tuple[str, ...] = ()

@@ -59,6 +59,24 @@ class DropReason(StrEnum):
     """A message by MQTT that is neither a packet nor the description of a router."""
     MQTT_FULL = auto()
     """One router or one message by MQTT more than there is room for."""
+    TLS_FULL = auto()
+    """More connections to Secure ADS than there is room for, or faster than is allowed."""
+    TLS_HANDSHAKE = auto()
+    """A connection to Secure ADS began no TLS, or none with methods and keys that fit."""
+    TLS_SLOW = auto()
+    """A connection by Secure ADS did not complete its handshake in time."""
+    TLS_CERTIFICATE = auto()
+    """A certificate by Secure ADS was missing, expired, or of an authority that is not trusted."""
+    TLS_FINGERPRINT = auto()
+    """A self-signed certificate by Secure ADS had another fingerprint than the known ones."""
+    TLS_NAME = auto()
+    """A certificate by Secure ADS was for another host, or named nobody."""
+    TLS_VERSION = auto()
+    """Secure ADS of another version."""
+    TLS_INFO = auto()
+    """A connection by Secure ADS that did not begin with its message, or broke off in it."""
+    TLS_USER = auto()
+    """A request for a route by Secure ADS with a wrong user or password, or that was refused."""
 
 
 _DROP_REASONS = tuple(DropReason)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING
 
 from eap.pd.handover import PortChanges
 from eap.pd.spec import StationSpec
@@ -24,6 +25,9 @@ from eap.services.mailbox_sockets import (
 from eap.services.network import Network, OpenSocketUser
 from eap.services.tasks import keep_serving
 from eap.services.transports.ams_tcp import AmsUplinks
+
+if TYPE_CHECKING:
+    from eap.services.transports.secure_listener import SecureListeners
 
 
 class Transports:
@@ -53,14 +57,19 @@ class Transports:
         self._group: asyncio.TaskGroup | None = None
         self._sources = {station.name: _addresses_of(station) for station in network.table.stations}
         self._follow_sockets()
-        self._uplinks = [
-            AmsUplinks(
+        self._uplinks = {
+            station.name: AmsUplinks(
                 network.routers[station.name],
                 self._sources[station.name],
                 network.drop_counter([station.name]),
+                network.routes[station.name].secure_settings,
             )
             for station in network.table.stations
-        ]
+        }
+        self._secure: dict[str, SecureListeners] = {}
+        self._ams = {station.name: _ams_addresses_of(station) for station in network.table.stations}
+        for name in self._uplinks:
+            network.routes[name].on_spec.append(partial(self._follow_secure, name))
 
     async def serve(self) -> None:
         """Serve all of them until cancelled."""
@@ -68,12 +77,14 @@ class Transports:
             async with asyncio.TaskGroup() as self._group:
                 for key in self._open:
                     self._start(key)
-                for uplinks in self._uplinks:
+                for name, uplinks in self._uplinks.items():
                     self._group.create_task(keep_serving(uplinks.serve))
+                    self._follow_secure(name)
                 self._group.create_task(keep_serving(self._network.links.serve))
                 await asyncio.Event().wait()
         finally:
             self._group = None
+            self._secure.clear()
 
     async def follow(self, station: StationSpec, changes: PortChanges) -> None:
         """Close and open transports after the ports of *station* have changed."""
@@ -92,6 +103,8 @@ class Transports:
             for owner in released:
                 user.release(owner)
         self._sources[station.name][:] = _addresses_of(station)
+        self._ams[station.name][:] = _ams_addresses_of(station)
+        self._follow_secure(station.name)
         self._follow_sockets()
 
     def close(self) -> None:
@@ -113,10 +126,35 @@ class Transports:
                     self._open[shared.key] = opener(self._network, shared)
                     self._start(shared.key)
 
+    def _follow_secure(self, station: str) -> None:
+        """Have the listeners and connections of Secure ADS that *station* is configured for."""
+        routes = self._network.routes[station]
+        self._uplinks[station].follow()
+        if station in self._secure:
+            self._secure[station].follow()
+        elif routes.spec.secure is not None and self._group is not None:
+            # Imported here: few plants have it.
+            from eap.services.transports.secure_listener import SecureListeners
+
+            secure = self._secure[station] = SecureListeners(
+                routes,
+                self._ams[station],
+                self._network.drop_counter([station]),
+                self._network.listeners,
+                self._network.route_logins,
+            )
+            self._group.create_task(keep_serving(secure.serve))
+
     def _start(self, key: SharedSocket) -> None:
         listener = self._open[key].listener
         if self._group is not None and listener is not None and key not in self._tasks:
             self._tasks[key] = self._group.create_task(keep_serving(listener.serve))
+
+
+def _ams_addresses_of(station: StationSpec) -> list[str]:
+    """Return the addresses where *station* serves AMS, each once."""
+    uris = (port.interface for port in station.ports if port.ams)
+    return list(dict.fromkeys(uri.host for uri in uris if uri.scheme in {"udp", "tcp"}))
 
 
 def _addresses_of(station: StationSpec) -> list[str]:

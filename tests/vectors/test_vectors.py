@@ -13,7 +13,7 @@ from devicebus.wire.datagram import (
     encode_frame,
     iter_datagrams,
 )
-from eap.codec import ams, amsdiscovery, mailbox, pd
+from eap.codec import ams, amsdiscovery, mailbox, pd, secureads
 from eap.codec.ethercat import EtherCatHeader, FrameType
 from eap.codec.wire import WireStruct
 from eap.errors import TruncatedError
@@ -23,6 +23,7 @@ FRAMES = [v for v in load_all("ethernet", "frame") if not v.error]
 MESSAGES = load_all("mailbox")
 PACKETS = load_all("ams")
 DISCOVERIES = load_all("ams_discovery")
+SECURE = load_all("secure_ads")
 
 
 def by_name(vectors: list[Vector]) -> pytest.MarkDecorator:
@@ -161,7 +162,22 @@ def test_ams_discovery(vector: Vector) -> None:
     assert amsdiscovery.encode_discovery(read.header, read.tags) == vector.octets
 
 
+@by_name(SECURE)
+def test_secure_ads(vector: Vector) -> None:
+    read = secureads.decode_connect_info(vector.octets)
+    fields = vector.fields
+    login = (bytes.fromhex(fields["user"]), bytes.fromhex(fields["password"]))
+    expected = secureads.ConnectInfo(
+        *(read.net_id, fields["flags"], fields["host"], fields["error"]),
+        *(*login, fields["version"]),
+    )
+    assert read == expected
+    assert str(read.net_id) == fields["net_id"]
+    if not vector.name.endswith("refusal"):  # which has surplus bytes
+        assert read.encode() == vector.octets
+
+
 def test_every_file_is_used() -> None:
-    all_used = FRAMES + MESSAGES + PACKETS + DISCOVERIES
+    all_used = FRAMES + MESSAGES + PACKETS + DISCOVERIES + SECURE
     used = {v.name.partition("/")[0] for v in all_used} | {"type1_datagrams"}
     assert used == {path.stem for path in FOLDER.glob("*.yaml")}

@@ -19,7 +19,15 @@ from msgspec.structs import replace
 from eap.ads.request import Operation, Write, WriteControl
 from eap.ams.access import AccessList
 from eap.ams.routes import Origin, Route
-from eap.ams.spec import AccessRule, HopSpec, MqttSpec, RouteSpec, RoutingSpec, TransportKind
+from eap.ams.spec import (
+    AccessRule,
+    HopSpec,
+    MqttSpec,
+    RouteSpec,
+    RoutingSpec,
+    SecureRouteSpec,
+    TransportKind,
+)
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import AMS_TCP_PORT, IO_PORT
 from eap.codec.ethercat import EAP_PORT
@@ -67,12 +75,12 @@ def to_route(spec: RouteSpec, hop: Endpoint, origin: Origin) -> Route:
 
 
 def to_endpoint(hop: HopSpec) -> Endpoint:
-    """Return transport and address of a hop; each AMS/TCP uplink is a transport of its own.
+    """Return transport and address of a hop; each uplink is a transport of its own.
 
     Raises:
         ValueError: the address is not that of one station, or does not fit the transport.
     """
-    if hop.kind is TransportKind.AMS_TCP:
+    if hop.kind in {TransportKind.AMS_TCP, TransportKind.AMS_TLS}:
         # A transport for each peer, because each has a connection and a state of its own.
         return Endpoint(f"{hop.kind}:{hop.address}", hop.address)
     address = hop.address
@@ -169,6 +177,7 @@ class StationRoutes:
     Attributes:
         router: Router of the station.
         scanners: Send requests to routers of other hosts, one for each address of the station.
+        on_spec: Called after another configuration is in force.
     """
 
     def __init__(
@@ -181,6 +190,7 @@ class StationRoutes:
     ) -> None:
         self.router = router
         self.scanners: list[RouterRequests] = []
+        self.on_spec: list[Callable[[], None]] = []
         self._spec = spec
         self._store = store
         self._open_hop = open_hop
@@ -213,6 +223,26 @@ class StationRoutes:
         self._apply_spec()
         for each in self._added:  # a configured route of the same hop may have hidden one of them
             self._add_to_table(each)
+        for notify in self.on_spec:
+            notify()
+
+    def secure_settings(self, hop: Endpoint) -> SecureRouteSpec:
+        """Return the settings of the route that leads to *hop* by Secure ADS, complete."""
+        for spec in (*self._configured.values(), *self._added):
+            if spec.tls is not None and to_endpoint(spec.hop) == hop:
+                return spec.tls.complete(self._spec.secure)
+        return SecureRouteSpec()
+
+    def secure_clients(self) -> dict[str, str]:
+        """Return the names of clients by Secure ADS by the fingerprints that they are known by."""
+        secure = self._spec.secure
+        known = {
+            spec.tls.fingerprint: spec.name
+            for spec in (*self._added, *self._configured.values())
+            if spec.tls is not None and spec.tls.fingerprint and not spec.is_unidirectional
+        }
+        peers = () if secure is None else secure.peers
+        return known | {each.fingerprint: each.name for each in peers}
 
     def is_derived(self, route: Route) -> bool:
         """Return whether a route follows from the ports of the plant."""

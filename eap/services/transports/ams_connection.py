@@ -24,7 +24,13 @@ from typing import ClassVar, Protocol
 
 import msgspec
 
-from eap.ams.reassembly import AmsStreamDecoder, OversizedPacket, RouterRequest, StreamItem
+from eap.ams.reassembly import (
+    AmsStreamDecoder,
+    BareAmsDecoder,
+    OversizedPacket,
+    RouterRequest,
+    StreamItem,
+)
 from eap.codec.ads import AdsError, IndexGroup
 from eap.codec.ams import (
     AmsAnswer,
@@ -255,6 +261,7 @@ class AmsConnection(asyncio.BufferedProtocol):
 
     _busy_count: ClassVar[int] = 0
     """Number of connections of this process with more packets."""
+    _make_decoder: ClassVar[type[AmsStreamDecoder | BareAmsDecoder]] = AmsStreamDecoder
 
     def __init__(
         self,
@@ -276,7 +283,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         self._handler = handler
         self._is_outgoing = is_outgoing
         self._window = AmsWindow()
-        self._cutter = AmsStreamDecoder(LONGEST_ANSWER if is_outgoing else LONGEST_PACKET)
+        self._cutter = self._make_decoder(LONGEST_ANSWER if is_outgoing else LONGEST_PACKET)
         self._transport: asyncio.Transport
         self._is_open = False
         self._is_paused = False
@@ -355,7 +362,7 @@ class AmsConnection(asyncio.BufferedProtocol):
                 self.close(CloseReason.OVERDUE)
             return "the peer does not read"
         for packet in packets:
-            transport.write(encode_with_prefix(packet))
+            transport.write(self._framed(packet))
             if self._window.note_outgoing(packet) and (self._is_paused or self._is_half_closed):
                 self._schedule()
         return None
@@ -377,6 +384,10 @@ class AmsConnection(asyncio.BufferedProtocol):
         self._is_closed = True
         if self._is_open:
             self._transport.abort()
+
+    def _framed(self, packet: bytes) -> bytes:
+        """Return a packet as the stream has it."""
+        return encode_with_prefix(packet)
 
     def _schedule(self) -> None:
         if not self._is_scheduled:
@@ -429,7 +440,7 @@ class AmsConnection(asyncio.BufferedProtocol):
         logger.debug("AMS/TCP connection %s closed: %s", self.name, why)
         self._handler.count_dropped(DropReason.AMS_TYPE)
         self._why = f"no AMS packets: {why}"
-        self._cutter = AmsStreamDecoder(0)
+        self._cutter = self._make_decoder(0)
         self._is_half_closed = True
         self._pause_reading()
         self._close_when_done()
@@ -483,4 +494,4 @@ class AmsConnection(asyncio.BufferedProtocol):
             self._handler.handle_answer(answer.encode(), self)
         elif not header.state_flags & _NO_RETURN and header.command != AmsCommand.NOTIFICATION:
             refusal = response_to(header, AmsAnswer(error_code=AdsError.AMS_LENGTH))
-            self._transport.write(encode_with_prefix(refusal))
+            self._transport.write(self._framed(refusal))

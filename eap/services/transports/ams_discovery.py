@@ -20,7 +20,13 @@ from typing import NamedTuple
 
 from eap.ams.access import AddRoute, AuditedOperation, AuditEntry, Decision
 from eap.ams.routes import Origin, RouteTable
-from eap.ams.spec import AccessService, HopSpec, RouteSpec, TransportKind
+from eap.ams.spec import (
+    AccessService,
+    HopSpec,
+    RouteSpec,
+    SecureRouteSpec,
+    TransportKind,
+)
 from eap.codec.ads import AdsError
 from eap.codec.ams import AMS_TCP_PORT, SYSTEM_PORT, AmsHeader
 from eap.codec.amsdiscovery import (
@@ -36,6 +42,7 @@ from eap.codec.amsdiscovery import (
     encode_text,
     encode_version,
 )
+from eap.codec.secureads import AMS_TLS_PORT
 from eap.errors import CodecError, ControlError, EnvironmentalError
 from eap.ids import STATION_OCTETS, Endpoint, NetId, parse_host
 from eap.net.limits import Rate, SourceRateLimiter, SourceRates
@@ -91,7 +98,7 @@ class RouteAdmin:
         self._limiter = SourceRateLimiter(RATES, MAX_SOURCES, clock())
 
     async def handle(
-        self, request: Discovery, sender: str, *, is_this_host: bool
+        self, request: Discovery, sender: str, *, is_this_host: bool, fingerprint: str = ""
     ) -> AdsError | None:
         """Add the requested route, and return the result for its sender.
 
@@ -101,6 +108,7 @@ class RouteAdmin:
             request: The datagram.
             sender: Its source IPv4 address.
             is_this_host: Whether a program of this host sent it.
+            fingerprint: Of the sender's certificate, by Secure ADS; the route goes by it too.
         """
         now_s = self._clock()
         is_allowed = (
@@ -110,19 +118,20 @@ class RouteAdmin:
             return None
         name = _text(request, Tag.ROUTE_NAME)[:_SHOWN]
         results = []
+        endpoint = Endpoint(TransportKind.AMS_TLS if fingerprint else "ams-udp", sender)
         denials = await self._denials(request, sender, is_this_host=is_this_host)
         for station, denial in zip(self._stations, denials, strict=True):
-            wanted = _audited(station.router.net_id, request, sender, AdsError.NONE, "")
+            wanted = _audited(station.router.net_id, request, endpoint, AdsError.NONE, "")
             # Recorded before the change, because an audit that is required must not miss it.
             why = "" if denial else station.router.why_not_recorded(wanted)
             if why:
                 result = AdsError.ACCESS
             else:
-                result, why = await _decide(station, request, sender, denial)
+                result, why = await _decide(station, request, sender, denial, fingerprint)
             level = logging.INFO if result == AdsError.NONE else logging.WARNING
             cause = caused_by((station.router.net_id, name, sender, why), sender)
             logger.log(level, "route %r requested by %s: %s", name, sender, why, extra=cause)
-            entry = _audited(station.router.net_id, request, sender, result, why)
+            entry = _audited(station.router.net_id, request, endpoint, result, why)
             for write in station.router.on_audit:
                 write(entry)
             # All stations decide, although only one answer is sent: the first error of them.
@@ -144,7 +153,7 @@ class RouteAdmin:
 
 
 def _audited(
-    router: NetId, request: Discovery, sender: str, result: AdsError, why: str
+    router: NetId, request: Discovery, endpoint: Endpoint, result: AdsError, why: str
 ) -> AuditEntry:
     """Return the entry of the audit about a request."""
     net_id = NetId((request.find(Tag.NET_ID) or b"")[:6].ljust(6, b"\0"))
@@ -157,22 +166,22 @@ def _audited(
     decision = Decision(AccessService.CONTROL, result != AdsError.ACCESS, why)
     header = AmsHeader(router, SYSTEM_PORT, net_id, 0, 0)
     done = AuditedOperation(wanted, decision, result)
-    return AuditEntry(Endpoint("ams-udp", sender), header, "", (done,))
+    return AuditEntry(endpoint, header, "", (done,))
 
 
 async def _decide(
-    station: StationRoutes, request: Discovery, sender: str, denial: str
+    station: StationRoutes, request: Discovery, sender: str, denial: str, fingerprint: str
 ) -> tuple[AdsError, str]:
     """Return the result for the sender, and a text for the log."""
     if denial:
         # Tools expect 0x704 after a wrong password.
         return AdsError.ACCESS, f"refused: {denial}"
     try:
-        wanted = _read(request, sender)
+        wanted = _read(request, sender, AMS_TLS_PORT if fingerprint else AMS_TCP_PORT)
         configured = _configured(station.router.table, wanted.net_id)
         if configured:
             return AdsError.NONE, f"route {configured!r} of the plant file leads there"
-        await _add(station, wanted)
+        await _add(station, wanted, fingerprint)
     except (ValueError, ControlError) as exc:
         return AdsError.VALUE, f"refused: {exc}"
     except EnvironmentalError as exc:
@@ -184,13 +193,13 @@ def _text(request: Discovery, tag: int) -> str:
     return decode_text(request.find(tag) or b"")
 
 
-def _read(request: Discovery, sender: str) -> _RouteRequest:
+def _read(request: Discovery, sender: str, usual_port: int) -> _RouteRequest:
     """Return the requested route; raise ValueError if its values are impossible."""
     octets = request.find(Tag.NET_ID) or b""
     if len(octets) != 6 or not any(octets):
         raise ValueError("the request has no NetID")
     where = _text(request, Tag.HOST).strip() or sender
-    host, port = parse_host(where, AMS_TCP_PORT)
+    host, port = parse_host(where, usual_port)
     name = _text(request, Tag.ROUTE_NAME).strip() or where
     options = int.from_bytes((request.find(Tag.OPTIONS) or b"")[:4], "little")
     return _RouteRequest(name, NetId(octets), host, port, not options & TEMPORARY)
@@ -205,9 +214,10 @@ def _configured(table: RouteTable, net_id: NetId) -> str:
     return route.name if octets and route.origin is Origin.STATIC else ""
 
 
-async def _add(station: StationRoutes, wanted: _RouteRequest) -> None:
+async def _add(station: StationRoutes, wanted: _RouteRequest, fingerprint: str) -> None:
     """Add a route for all NetIDs of the requested station, or for the requested NetID alone."""
-    hop = HopSpec(TransportKind.AMS_TCP, "", f"{wanted.host}:{wanted.port}")
+    kind = TransportKind.AMS_TLS if fingerprint else TransportKind.AMS_TCP
+    hop = HopSpec(kind, "", f"{wanted.host}:{wanted.port}")
     is_here = station.has(wanted.net_id.station)
     spec = RouteSpec(
         name=wanted.name,
@@ -217,6 +227,7 @@ async def _add(station: StationRoutes, wanted: _RouteRequest) -> None:
         octets=len(wanted.net_id) if is_here else STATION_OCTETS,
         is_probed=False,  # most tools answer no requests
         is_client=True,
+        tls=SecureRouteSpec(fingerprint=fingerprint) if fingerprint else None,
     )
     await station.add(spec, is_kept=wanted.is_kept)
 

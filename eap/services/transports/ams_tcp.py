@@ -16,11 +16,12 @@ from ipaddress import IPv4Address
 from secrets import randbelow
 from threading import Thread
 from time import monotonic_ns
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict
 
-from eap.ams.spec import TransportKind
+from eap.ams.spec import SecureRouteSpec, TransportKind
 from eap.ams.transport_table import Transport
 from eap.codec.ams import AMS_TCP_PORT
+from eap.codec.secureads import AMS_TLS_PORT
 from eap.ids import Endpoint, NetId, parse_host
 from eap.net.limits import OVERDUE_NS, CloseReason, ListenerLimits
 from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
@@ -197,8 +198,8 @@ _STABLE_S = 10.0
 """After a connection of this duration the pauses begin anew."""
 
 
-PEER_PREFIX = f"{TransportKind.AMS_TCP}:"
-"""Prefix of the names of uplink transports; the address of the peer follows."""
+_UPLINKS = frozenset((TransportKind.AMS_TCP, TransportKind.AMS_TLS))
+"""Kinds of transports with uplinks, whose names have the address of the peer behind the kind."""
 
 
 class PeerAddress(NamedTuple):
@@ -210,6 +211,15 @@ class PeerAddress(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.host}:{self.port}"
+
+
+class UplinkArguments(TypedDict):
+    """Arguments of :class:`AmsUplink` that all uplinks of a station have alike."""
+
+    sources: Collection[str]
+    claims: dict[tuple[str, int], AmsUplink]
+    count_dropped: Callable[[DropReason], None]
+    may_be_client: Callable[[], bool]
 
 
 class AmsUplink(ReconnectingLink):
@@ -350,10 +360,11 @@ class AmsUplink(ReconnectingLink):
         """Serve an open connection; return the reason of its end."""
         loop = asyncio.get_running_loop()
         self._closed = loop.create_future()
+        try:
+            connection = await self._open(sock, host)
+        except OSError as exc:
+            return f"{self.peer}: {exc.strerror or exc}"
         since = loop.time()
-        _, connection = await loop.create_connection(
-            lambda: AmsConnection(str(self.peer), host, self, is_outgoing=True), sock=sock
-        )
         try:
             # Four checks in that time: the limit is exceeded by a quarter at most.
             while not (await asyncio.wait([self._closed], timeout=self._overdue_ns / 4e9))[0]:
@@ -370,6 +381,14 @@ class AmsUplink(ReconnectingLink):
         if loop.time() - since < 1:
             return f"{self.peer} closes connections at once: it may have no route back ({why})"
         return f"{self.peer}: {why}"
+
+    async def _open(self, sock: socket.socket, host: str) -> AmsConnection:
+        """Return the connection on a connected socket; raise OSError if there cannot be one."""
+        loop = asyncio.get_running_loop()
+        _, connection = await loop.create_connection(
+            lambda: AmsConnection(str(self.peer), host, self, is_outgoing=True), sock=sock
+        )
+        return connection
 
 
 def source_for(host: str, sources: Collection[str]) -> str | None:
@@ -391,6 +410,7 @@ class AmsUplinks:
         router: Router of the station.
         sources: The station's own IPv4 addresses.
         count_dropped: Counts dropped packets.
+        settings_of: Returns the settings of the route that leads to a hop by Secure ADS.
     """
 
     def __init__(
@@ -398,10 +418,14 @@ class AmsUplinks:
         router: StationRouter,
         sources: Collection[str],
         count_dropped: Callable[[DropReason], None],
+        settings_of: Callable[[Endpoint], SecureRouteSpec] = lambda hop: SecureRouteSpec(),
     ) -> None:
         self._router = router
         self._sources = sources
         self._count_dropped = count_dropped
+        self._settings_of = settings_of
+        self._used: dict[Endpoint, SecureRouteSpec] = {}
+        """Settings of the open ones, by Secure ADS."""
         self._uplinks: dict[Endpoint, AmsUplink] = {}
         self._tasks: dict[Endpoint, asyncio.Task[None]] = {}
         self._claims: dict[tuple[str, int], AmsUplink] = {}
@@ -417,26 +441,33 @@ class AmsUplinks:
                 self._start(endpoint)
             await asyncio.Event().wait()
 
+    def follow(self) -> None:
+        """Connect again where settings of Secure ADS have changed."""
+        for hop in list(self._used):
+            self._follow(hop)
+
     def _follow(self, hop: Endpoint) -> None:
         """Open or close the connection to *hop* after its routes changed."""
-        if not hop.transport.startswith(PEER_PREFIX):
+        if hop.kind not in _UPLINKS or hop.transport == hop.kind:
             return
         is_used = any(route.hop == hop for route in self._router.table)
+        if hop in self._uplinks and (not is_used or self._has_changed(hop)):
+            self._close(hop)
         if is_used and hop not in self._uplinks:
             self._open(hop)
-        elif not is_used and hop in self._uplinks:
-            self._close(hop)
+
+    def _has_changed(self, hop: Endpoint) -> bool:
+        return hop in self._used and self._used[hop] != self._settings_of(hop)
 
     def _open(self, hop: Endpoint) -> None:
+        is_secure = hop.kind == TransportKind.AMS_TLS
         try:
-            peer = PeerAddress(*parse_host(hop.connection, AMS_TCP_PORT))
+            usual = AMS_TLS_PORT if is_secure else AMS_TCP_PORT
+            peer = PeerAddress(*parse_host(hop.connection, usual))
         except ValueError as exc:
             logger.warning("%s: route ignored: %s", self._router.name, exc)
             return
-        self._uplinks[hop] = uplink = AmsUplink(
-            peer,
-            *hop,
-            self._router,
+        rest = UplinkArguments(
             sources=self._sources,
             claims=self._claims,
             count_dropped=self._count_dropped,
@@ -444,6 +475,17 @@ class AmsUplinks:
                 route.is_client for route in self._router.table if route.hop == hop
             ),
         )
+        if is_secure:
+            # Imported here: few plants have such a route.
+            from eap.services.transports.secure_ads import AmsTlsUplink
+
+            self._used[hop] = self._settings_of(hop)
+            uplink: AmsUplink = AmsTlsUplink(
+                peer, *hop, self._router, settings=self._used[hop], rest=rest
+            )
+        else:
+            uplink = AmsUplink(peer, *hop, self._router, **rest)
+        self._uplinks[hop] = uplink
         self._router.add_transport(Transport(hop.transport, is_stream=True, is_hub=True), uplink)
         self._start(hop)
 
@@ -451,6 +493,7 @@ class AmsUplinks:
         if (task := self._tasks.pop(hop, None)) is not None:
             task.cancel()
         self._uplinks.pop(hop).end()
+        self._used.pop(hop, None)
         self._router.hop_up(*hop)  # a removed hop has no state
         self._router.remove_transport(hop.transport)
 

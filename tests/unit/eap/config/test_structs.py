@@ -64,9 +64,9 @@ def examples(*keys):
     return [each for each in found if each.startswith(tuple(f"{key}:\n" for key in keys))]
 
 
-@pytest.mark.parametrize("example", examples("routes", "access", "users"))
+@pytest.mark.parametrize("example", examples("routes", "access", "users", "secure_ads"))
 def test_the_examples_of_the_reference_are_right(example, tmp_path):
-    for name in ("certificates/plant.pem", "certificates/mixer.pem"):
+    for name in ("certificates/plant.pem", "certificates/works.pem", "certificates/mixer.pem"):
         touch(tmp_path / name)
     for name in ("mixer", "mixer.key", "administrator"):
         touch(tmp_path / "secrets" / name)
@@ -80,7 +80,7 @@ def test_the_examples_of_the_reference_are_right(example, tmp_path):
 
 
 def test_examples_cover_all_keys_of_routing():
-    assert len(examples("routes", "access", "users")) == 4
+    assert len(examples("routes", "access", "users", "secure_ads")) == 5
 
 
 def touch(file):
