@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from eap.recording.replay import ReplayFrame
 
 
+_LARGE_BYTES = 100_000_000
+
+
 @click.command(
     epilog=examples(
         "eapctl replay line.pcapng --dry-run",
@@ -90,6 +93,8 @@ def replay(
         is_forced=force,
         plant=plant,
     )
+    if (size := _size_of(file)) >= _LARGE_BYTES:
+        click.echo(f"{file}: reading {size // 1_000_000} MB, which takes a while", err=True)
     running = Replay(request)
     if not dry_run:
         _run(running, request, is_stepped=step)
@@ -115,6 +120,13 @@ def _run(running: Replay, request: ReplayRequest, *, is_stepped: bool) -> None:
     finally:
         for each, handler in zip(ends, before, strict=True):
             signal.signal(each, handler)
+
+
+def _size_of(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except OSError:  # reported by the reader
+        return 0
 
 
 def _begin_text(result: ReplayResult, request: ReplayRequest) -> str:
