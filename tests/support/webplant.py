@@ -101,6 +101,9 @@ class StubPlant:
             self.values[name] = value
         return {"written": 1}
 
+    def _note_logins(self, params: dict[str, Any]) -> dict[str, Any]:
+        return {"noted": sum(each.count for each in params["refused"])}
+
 
 def user(name: str, role: Role, password: str = HASH) -> AccountSection:
     return AccountSection(name=name, role=role, password=password)
