@@ -40,6 +40,10 @@ if TYPE_CHECKING:
 _JSON = json_option("Print one object per gateway; docs/control.md explains its fields.")
 _TARGET = click.argument("target", metavar="STATION[/PORT]", shell_complete=complete_target)
 _SHOWN_CLIENTS = 10
+_PORT = 34980
+_TCP, _MAILBOX = "--tcp", "--mailbox"
+_FIRST_OF_COMMAND = 2
+"""Words until the options of a command may come: HOST and its name."""
 """Number of clients that are shown: each command is a client, so there may be hundreds."""
 
 
@@ -223,7 +227,6 @@ def _slave_text(row: MailboxFigures) -> str:
 
 
 def _table(columns: Iterable[Column | str], rows: Iterable[tuple[object, ...]]) -> TextTable:
-
     table = TextTable(*columns)
     for row in rows:
         table.add_row(*map(str, row))
@@ -232,12 +235,6 @@ def _table(columns: Iterable[Column | str], rows: Iterable[tuple[object, ...]]) 
 
 def _time(value: float | None) -> str:
     return "" if not value else f"{value / 1000:.1f} ms"
-
-
-_PORT = 34980
-_TCP, _MAILBOX = "--tcp", "--mailbox"
-_FIRST_OF_COMMAND = 2
-"""Words until the options of a command may come: HOST and its name."""
 
 
 def _parse_address(ctx: click.Context, param: click.Parameter, text: str) -> GatewayTarget:

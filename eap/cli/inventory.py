@@ -7,23 +7,19 @@ from pathlib import Path
 import click
 
 from eap.cli.output import write_json
-from eap.cli.params import PLANT_FILE
+from eap.cli.params import PLANT_FILE, examples
 
 
-@click.command()
+@click.command(epilog=examples("eapctl inventory line.yaml --list"))
 @click.argument("plant", type=PLANT_FILE)
 @click.option("--list", "is_list", is_flag=True, help="Print all hosts and groups; the default.")
 @click.option("--host", metavar="NAME", help="Print the variables of one host.")
 @click.option("--json", "is_json", is_flag=True, help="Print JSON, as without it.")
 def inventory(plant: Path, is_list: bool, host: str | None, is_json: bool) -> None:
-    r"""Print the hosts of PLANT as an Ansible inventory, a JSON object.
+    """Print the hosts of PLANT as an Ansible inventory, a JSON object.
 
     Ansible runs an executable file with --list or --host NAME as an inventory script;
     deploy/ansible/inventory of the sources is one.
-
-    \b
-    Example:
-      eapctl inventory line.yaml --list
     """
     from eap.ops import inventory as operations
     from eap.ops.plant import load_or_raise

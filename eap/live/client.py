@@ -19,7 +19,7 @@ _LONGEST_PAUSE_S = 2.0
 
 
 class LiveClient:
-    """One appliance, however its connection ends.
+    """Client of one appliance that connects again after its connection ended.
 
     Args:
         open_connection: Opens a connection; raises ControlError if that fails.

@@ -32,7 +32,7 @@ _SAID_OTHERWISE = ("in PREOP", "in SAFEOP", "starting")
 
 
 class LiveEvent(msgspec.Struct, frozen=True):
-    """Something that happened in a plant.
+    """Event in a plant.
 
     Attributes:
         time: Unix time at which it was noticed.

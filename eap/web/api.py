@@ -20,7 +20,7 @@ from eap.control.protocol import ErrorCode, WriteOrigin
 from eap.errors import ControlError
 from eap.ids import encode_value
 from eap.release import RELEASE
-from eap.web.feed import UNKNOWN, PlantFeed, Shown
+from eap.web.feed import UNKNOWN, PlantFeed, ShownValue
 from eap.web.guard import TOKEN, USER, Guard, is_browser, needs_user, read_json, refusal
 from eap.web.openapi import DOCUMENT
 from eap.web.rules import SetRules
@@ -260,7 +260,7 @@ class Api:
 
     async def _read_station(
         self, station: str, variables: list[str], is_pattern: bool
-    ) -> dict[str, tuple[Shown, int | None]]:
+    ) -> dict[str, tuple[ShownValue, int | None]]:
         """Return variables of one station; one that is silent hides no other that fits."""
         try:
             return await self._feed.read(station, variables)
@@ -269,7 +269,7 @@ class Api:
                 raise
             return {f"{station}/{each}": (UNKNOWN, None) for each in variables}
 
-    def _value(self, name: str, shown: Shown, quality: int | None) -> dict[str, Any]:
+    def _value(self, name: str, shown: ShownValue, quality: int | None) -> dict[str, Any]:
         return {
             "value": shown.value,
             "unit": self._feed.unit_of(name),

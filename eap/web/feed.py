@@ -63,8 +63,8 @@ class Variable(msgspec.Struct, frozen=True):
     settable: bool
 
 
-class Shown(NamedTuple):
-    """Present value: the array of messages.
+class ShownValue(NamedTuple):
+    """Present value of a variable; messages have it as an array.
 
     Attributes:
         value: As in the control protocol; None while it is unknown.
@@ -77,7 +77,7 @@ class Shown(NamedTuple):
     is_stale: bool
 
 
-UNKNOWN = Shown(None, None, True)
+UNKNOWN = ShownValue(None, None, True)
 
 
 class GraphLink(msgspec.Struct, frozen=True, kw_only=True):
@@ -215,7 +215,7 @@ class PlantFeed:
         self._wanted = {key: frozenset(names) for key, names in wanted.items()}
         self._update_watches()
 
-    def shown(self, name: str, now_s: float) -> Shown:
+    def shown(self, name: str, now_s: float) -> ShownValue:
         """Return the present value of a variable that is wanted."""
         station, _, variable = name.partition("/")
         for period_ms in (FAST_MS, SLOW_MS):
@@ -228,7 +228,9 @@ class PlantFeed:
             return self._state_of(station)
         return UNKNOWN
 
-    async def read(self, station: str, names: list[str]) -> dict[str, tuple[Shown, int | None]]:
+    async def read(
+        self, station: str, names: list[str]
+    ) -> dict[str, tuple[ShownValue, int | None]]:
         """Read variables of a station now; raise ControlError if that fails.
 
         Returns:
@@ -237,7 +239,7 @@ class PlantFeed:
         directory = self._known(station)
         states = [name for name in names if name == STATE and STATE not in directory.variables]
         asked = [name for name in names if name not in states]
-        found: dict[str, tuple[Shown, int | None]] = {
+        found: dict[str, tuple[ShownValue, int | None]] = {
             name: (self._state_of(station), None) for name in states
         }
         if asked:
@@ -339,30 +341,30 @@ class PlantFeed:
         # A subscription with one unknown name would be refused as a whole.
         return variable_of(variable, directory.variables) in directory.variables
 
-    def _state_of(self, station: str) -> Shown:
+    def _state_of(self, station: str) -> ShownValue:
         report = self.report
         for row in report.status.stations if report else ():
             if row["name"] == station:
-                return Shown(row["state"], row.get("cycle_age_us"), is_hung(row))
+                return ShownValue(row["state"], row.get("cycle_age_us"), is_hung(row))
         return UNKNOWN
 
-    def _of_sample(self, station: str, variable: str, sample: _Sample, now_s: float) -> Shown:
+    def _of_sample(self, station: str, variable: str, sample: _Sample, now_s: float) -> ShownValue:
         assert sample.event is not None  # noqa: S101  the callers have looked
         silent_s = now_s - sample.at_s
         still_s = now_s - sample.cycle_at_s
         is_stale = still_s > sample.period_s + _STALE_AFTER_S
         value = sample.event.values.get(variable)
         if variable not in sample.event.quality:
-            return Shown(value, int(still_s * 1e6), is_stale)
+            return ShownValue(value, int(still_s * 1e6), is_stale)
         quality = sample.event.quality[variable]
         if quality is None:
-            return Shown(value, None, True)
+            return ShownValue(value, None, True)
         age_us = quality * QUALITY_NS // 1000 + int(silent_s * 1e6)
         directory = self.directories.get(station)
         whole = variable_of(variable, directory.variables) if directory else variable
         if quality == QUALITY_MAX:  # saturated: the age of the last PD says more
             age_us = max(age_us, self._ages.get(station, {}).get(whole, 0))
-        return Shown(value, age_us, is_stale or whole in self._stale.get(station, ()))
+        return ShownValue(value, age_us, is_stale or whole in self._stale.get(station, ()))
 
     async def _take_status(self) -> None:
         self.report = report = await self._view.take()

@@ -24,7 +24,7 @@ from eap.web.guard import MAX_BODY, Guard
 from eap.web.metrics import PATH as METRICS
 from eap.web.metrics import MetricsEndpoint
 from eap.web.sessions import Sessions
-from eap.web.sockets import Sockets
+from eap.web.sockets import WebSocketServer
 from eap.web.topics import PageTopics
 
 STATIC = Path(__file__).parent / "static"
@@ -67,7 +67,7 @@ class PageServer:
         self.guard = Guard(section, Sessions(key, users))
         self.feed = PlantFeed(view, on_status=self._status_changed)
         self.topics = PageTopics(self.feed)
-        self.sockets = Sockets(self.feed, self.topics, self.guard)
+        self.sockets = WebSocketServer(self.feed, self.topics, self.guard)
         self.api = Api(section, self.feed, self.topics, self.guard, self.sockets.end_session)
 
     def application(self) -> web.Application:

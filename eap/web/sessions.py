@@ -70,7 +70,9 @@ class Sessions:
         return Principal(user.name, user.role)
 
     def end(self, token: str) -> None:
-        """End a session; of very many the first ones are forgotten."""
+        """End a session before its time."""
+        # Memory is bounded: of very many, the first ones are valid again until they expire. Only
+        # users that can log in can end so many.
         self._ended[token] = None
         if len(self._ended) > _MAX_ENDED:
             self._ended.popitem(last=False)

@@ -1,7 +1,7 @@
 """WebSockets of browsers: topics out, the wanted topics in.
 
-A client that does not read stalls nobody: its own task waits for it, its slot keeps the latest
-message of each topic, and after SLOW_S without progress it is disconnected.
+A client that does not read stalls nobody: its own task waits for it, only the latest message of
+each part of a topic is kept for it, and after SLOW_S without progress it is disconnected.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from eap.release import RELEASE
 from eap.web.feed import PlantFeed
 from eap.web.guard import TOKEN, Guard, needs_user, refusal
 from eap.web.sessions import SESSION_S
-from eap.web.topics import PageTopics, Slot
+from eap.web.topics import PageTopics, PendingMessages
 
 MAX_CLIENTS = 200
 MAX_PER_HOST = 100
@@ -29,14 +29,14 @@ _RATE = 20, 2.0
 """Messages of a client at once, and each second in the long run."""
 
 
-class Wanted(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Message of a client: all topics that it wants from now on."""
+class TopicRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Message of a client: the topics that it gets from now on."""
 
     subscribe: list[str]
 
 
-class Sockets:
-    """All WebSockets.
+class WebSocketServer:
+    """WebSockets of all clients.
 
     Args:
         feed: The plant.
@@ -65,7 +65,7 @@ class Sockets:
         )
         await socket.prepare(request)
         self._open[socket] = host, request[TOKEN]
-        slot = Slot()
+        pending = PendingMessages()
         welcome = {
             "type": "welcome",
             "version": 1,
@@ -78,8 +78,8 @@ class Sockets:
             # A session that has expired ends here too; the page connects again.
             async with asyncio.timeout(SESSION_S), asyncio.TaskGroup() as group:
                 await self._send(socket, msgspec.json.encode(welcome))
-                sending = group.create_task(self._send_all(socket, slot))
-                await self._receive(socket, slot)
+                sending = group.create_task(self._send_all(socket, pending))
+                await self._receive(socket, pending)
                 sending.cancel()
         except* (OSError, TimeoutError, RuntimeError):
             # The client has gone, or does not read: close() would wait for it.
@@ -88,7 +88,7 @@ class Sockets:
                     request.transport.abort()
         finally:
             del self._open[socket]
-            self._topics.leave(slot)
+            self._topics.leave(pending)
         return socket
 
     async def close_all(self) -> None:
@@ -106,7 +106,7 @@ class Sockets:
                     async with asyncio.timeout(0.2):
                         await socket.close(code=WSCloseCode.POLICY_VIOLATION)
 
-    async def _receive(self, socket: web.WebSocketResponse, slot: Slot) -> None:
+    async def _receive(self, socket: web.WebSocketResponse, pending: PendingMessages) -> None:
         clock = asyncio.get_running_loop().time
         rate = RateLimiter(*_RATE, clock())
         async for message in socket:
@@ -117,7 +117,7 @@ class Sockets:
                 text = b'expected {"subscribe": [TOPIC, ...]}'
                 await socket.close(code=WSCloseCode.INVALID_TEXT, message=text)
                 return
-            errors = self._topics.replace(slot, wanted.subscribe)
+            errors = self._topics.replace(pending, wanted.subscribe)
             answer: dict[str, Any] = {
                 "type": "subscribed",
                 "topics": [each for each in wanted.subscribe if each not in errors],
@@ -125,9 +125,9 @@ class Sockets:
             }
             await self._send(socket, msgspec.json.encode(answer))
 
-    async def _send_all(self, socket: web.WebSocketResponse, slot: Slot) -> None:
+    async def _send_all(self, socket: web.WebSocketResponse, pending: PendingMessages) -> None:
         while True:
-            for message in await slot.take():
+            for message in await pending.take():
                 await self._send(socket, message)
 
     async def _send(self, socket: web.WebSocketResponse, message: bytes) -> None:
@@ -135,10 +135,10 @@ class Sockets:
             await socket.send_frame(message, WSMsgType.TEXT)
 
 
-def _decode(message: WSMessage) -> Wanted | None:
+def _decode(message: WSMessage) -> TopicRequest | None:
     if message.type is not WSMsgType.TEXT:
         return None
     try:
-        return msgspec.json.decode(message.data, type=Wanted)
+        return msgspec.json.decode(message.data, type=TopicRequest)
     except msgspec.MsgspecError:
         return None

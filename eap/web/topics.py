@@ -1,8 +1,8 @@
 """Messages of the WebSocket, made once for all clients that want the same.
 
 A topic is a page, a set of variables, the plant's overview or its events.  Each message has all
-that is present in its part of a topic, so a client may miss any number of messages; of each part
-it has one slot, which holds the latest.
+that is present in its part of a topic, so a client may miss any number of messages: of each part,
+only the latest waits for it.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class TopicPart(NamedTuple):
     period_ms: int
 
 
-class Slot:
-    """Messages for one client that were not sent yet: the latest of each part."""
+class PendingMessages:
+    """Messages to one client that were not sent yet: the latest of each part."""
 
     def __init__(self) -> None:
         self._messages: dict[TopicPart, bytes] = {}
@@ -74,7 +74,7 @@ class _Topic:
         self.name = name
         self.patterns = {FAST_MS: fast, SLOW_MS: slow}
         self.names: dict[int, list[str]] = {FAST_MS: [], SLOW_MS: []}
-        self.slots: set[Slot] = set()
+        self.clients: set[PendingMessages] = set()
         self.latest: dict[TopicPart, bytes] = {}
 
     def resolve(self, feed: PlantFeed) -> None:
@@ -116,7 +116,7 @@ class PageTopics:
                 topic.patterns = {FAST_MS: fast, SLOW_MS: slow}
         self._version = -1
 
-    def replace(self, slot: Slot, wanted: Iterable[str]) -> dict[str, str]:
+    def replace(self, client: PendingMessages, wanted: Iterable[str]) -> dict[str, str]:
         """Have a client get the *wanted* topics and no others; return reasons of unknown ones."""
         errors: dict[str, str] = {}
         found: dict[str, _Topic] = {}
@@ -129,23 +129,23 @@ class PageTopics:
             except TopicError as exc:
                 errors[name[:MAX_TOPIC]] = str(exc)
         for name, topic in list(self._topics.items()):
-            if slot in topic.slots and name not in found:
-                topic.slots.discard(slot)
+            if client in topic.clients and name not in found:
+                topic.clients.discard(client)
         for name, topic in found.items():
             self._topics[name] = topic
-            topic.slots.add(slot)
+            topic.clients.add(client)
         self._drop_unwanted()
         self._version = -1
         self._refresh()
         for topic in found.values():
             for part in self._parts(topic):
-                slot.put(part, topic.latest.get(part) or self._encode(topic, part))
+                client.put(part, topic.latest.get(part) or self._encode(topic, part))
         return errors
 
-    def leave(self, slot: Slot) -> None:
+    def leave(self, client: PendingMessages) -> None:
         """Forget a client."""
         for topic in self._topics.values():
-            topic.slots.discard(slot)
+            topic.clients.discard(client)
         self._drop_unwanted()
         self._version = -1
 
@@ -181,8 +181,8 @@ class PageTopics:
 
     def _send(self, topic: _Topic, part: TopicPart) -> None:
         message = topic.latest[part] = self._encode(topic, part)
-        for slot in topic.slots:
-            slot.put(part, message)
+        for client in topic.clients:
+            client.put(part, message)
 
     def _encode(self, topic: _Topic, part: TopicPart) -> bytes:
         head: dict[str, Any] = {"topic": topic.name, "time": round(time(), 3)}
@@ -220,7 +220,7 @@ class PageTopics:
         raise TopicError(f"unknown topic {name!r}: expected plant, events, page:… or values:…")
 
     def _drop_unwanted(self) -> None:
-        self._topics = {name: topic for name, topic in self._topics.items() if topic.slots}
+        self._topics = {name: topic for name, topic in self._topics.items() if topic.clients}
 
     def _refresh(self) -> None:
         """Look the names of all topics up again after a change."""
