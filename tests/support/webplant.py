@@ -43,6 +43,7 @@ class StubPlant:
         values: Present values.
         quality: Of those that are received.
         written: Parameters of all writes.
+        logins: Refused logins, as the page reports them.
         answers: False while it does not answer.
     """
 
@@ -51,6 +52,7 @@ class StubPlant:
         self.quality: dict[str, int | None] = {"far": 3}
         self.rx = rx("from-mill")
         self.written: list[dict[str, Any]] = []
+        self.logins: list[Any] = []
         self.answers = True
         self.cycle = 0
 
@@ -58,6 +60,10 @@ class StubPlant:
         if not self.answers:
             raise ControlError("it closed the connection", code=ErrorCode.UNAVAILABLE)
         return copy.deepcopy(getattr(self, f"_{method}")(params))
+
+    def _note_logins(self, params: dict[str, Any]) -> dict[str, Any]:
+        self.logins.extend(params["refused"])
+        return {"noted": len(params["refused"])}
 
     async def watch(self, wanted: ValuesSubscription) -> AsyncGenerator[ValuesEvent | ControlError]:
         while self.answers:
