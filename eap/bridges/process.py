@@ -21,7 +21,7 @@ from eap.live.transport import UnixConnection
 from eap.runtime.bridges import BridgeFile
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import BridgeHandover
-from eap.runtime.log import start_logging
+from eap.runtime.log import LevelFile, start_logging
 from eap.runtime.startup import LIFE_PERIOD_S, Startup
 
 SectionT = TypeVar("SectionT", bound=msgspec.Struct)
@@ -52,6 +52,12 @@ def run_bridge(
     def connect() -> LiveClient:
         return LiveClient(partial(UnixConnection.open, folder.control_socket))
 
+    levels = LevelFile(folder.path)
+
+    def beat() -> None:
+        startup.beat()
+        levels.follow(handover.name)
+
     async def run() -> str:
         bridge = Bridge(
             handover.plant,
@@ -63,7 +69,7 @@ def run_bridge(
         )
         reason = ""
         try:
-            await _run(bridge, serve(bridge, section), startup, handover.supervisor)
+            await _run(bridge, serve(bridge, section), beat, handover.supervisor)
         except* EnvironmentalError as group:
             reason = str(group.exceptions[0])
             if not bridge.is_ready:
@@ -76,7 +82,9 @@ def run_bridge(
     return 0
 
 
-async def _run(bridge: Bridge, work: Awaitable[None], startup: Startup, parent: int) -> None:
+async def _run(
+    bridge: Bridge, work: Awaitable[None], beat: Callable[[], None], parent: int
+) -> None:
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -92,7 +100,7 @@ async def _run(bridge: Bridge, work: Awaitable[None], startup: Startup, parent: 
         tasks = [group.create_task(each) for each in (bridge.report(), serve())]
         while not ended.is_set() and os.getppid() == parent:
             if bridge.is_ready:
-                startup.beat()
+                beat()
             try:
                 async with asyncio.timeout(LIFE_PERIOD_S):
                     await ended.wait()

@@ -26,9 +26,9 @@ _LEVELS = ("debug", "info", "warning", "error")
 def log(level: str | None, area: str, plant: str | None, output: Renderer) -> None:
     """Show the log levels of running appliances, or set that of AREA, else of all areas.
 
-    LEVEL is debug, info, warning or error.  The areas are those of the services process: ads,
-    control, device, gateway, net, routing, slaves and transports.  A level holds until services
-    restarts, which begins with info.
+    LEVEL is debug, info, warning or error.  The areas are those of the services process (ads,
+    control, device, gateway, net, routing, slaves and transports) and the page, metrics and
+    bridges that the plant file asks for.  A level holds until services restarts.
     """
     from eap.control.log import LOG_LEVELS, SET_LOG_LEVEL
     from eap.ops.client import call_each, connect

@@ -9,7 +9,10 @@ from eap.control.protocol import Document, Method, NoParameters, Parameters
 LevelName: TypeAlias = Literal["debug", "info", "warning", "error"]
 ALL = "all"
 AREAS = ("ads", "control", "device", "gateway", "net", "routing", "slaves", "transports")
-"""Packages of services that log, and the drivers of sockets (``net``)."""
+"""Packages of services that log, and the drivers of sockets (``net``).
+
+Optional processes are areas by their own names.
+"""
 
 
 class LogLevelParameters(Parameters, frozen=True, kw_only=True):

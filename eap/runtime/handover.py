@@ -169,6 +169,8 @@ class WebHandover(InheritedRecord, frozen=True):
 
     supervisor: int
     """Process id, as in Handover."""
+    folder: str
+    """The appliance's runtime folder."""
     plant: str
     web: WebSection | None = None
     metrics: MetricsSection | None = None

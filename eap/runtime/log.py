@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -79,3 +82,42 @@ def start_logging(process: str, handler: logging.Handler | None = None) -> None:
     text = logging.Formatter(f"{process}: %(message)s")
     handler.setFormatter(_JsonFormatter(process) if is_json else text)
     logging.basicConfig(level=logging.INFO, handlers=[handler])
+
+
+class LevelFile:
+    """File with the log levels of optional processes, in the *folder* of their appliance.
+
+    Services writes it, and they look at it: so they need no connection for it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "log.levels"
+        self._changed_ns = 0
+
+    def read(self) -> dict[str, str]:
+        """Return the level of each process that has another one than info."""
+        with suppress(OSError, msgspec.DecodeError):
+            return msgspec.json.decode(self._path.read_bytes(), type=dict[str, str])
+        return {}
+
+    def write(self, levels: Mapping[str, str]) -> None:
+        """Replace the levels in one step.
+
+        Raises:
+            OSError: they cannot be kept.
+        """
+        temporary = self._path.with_suffix(".new")
+        temporary.write_bytes(msgspec.json.encode(levels))
+        temporary.replace(self._path)
+
+    def follow(self, process: str) -> None:
+        """Set the level of this *process*, if the file has changed since the last call."""
+        try:
+            changed_ns = self._path.stat().st_mtime_ns
+        except OSError:
+            return
+        if changed_ns != self._changed_ns:
+            self._changed_ns = changed_ns
+            level = self.read().get(process, "info").upper()
+            if level in logging.getLevelNamesMapping():
+                logging.getLogger("eap").setLevel(level)

@@ -40,7 +40,7 @@ from eap.runtime.handover import (
     Handover,
     PortName,
 )
-from eap.runtime.log import start_logging
+from eap.runtime.log import LevelFile, start_logging
 from eap.runtime.recordings import recording_findings
 from eap.runtime.startup import LIFE_PERIOD_S, Startup, Step, no_step
 from eap.runtime.store import StationStore, plant_folder
@@ -498,8 +498,16 @@ class Services:
             **AmsMethods(
                 devices.routers, self._directory, sockets.ams_address, deny_control
             ).table(),
-            **LogMethods().table(),
+            **LogMethods(LevelFile(self._folder.path), self._followers).table(),
         }
+
+    def _followers(self) -> list[str]:
+        """Return the optional processes that look at the file of log levels."""
+        try:
+            extras = self._folder.read_info().extras
+        except OSError:
+            return []
+        return [name for name in extras if not name.startswith("recording ")]
 
     def _audit(self, routers: Mapping[str, StationRouter]) -> Audit:
         file = AuditFile(plant_folder(self._handover.plant) / "audit.jsonl")

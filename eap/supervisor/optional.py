@@ -48,9 +48,9 @@ def optional_processes(
     own = os.getpid()
     handovers: dict[str, InheritedRecord] = {}
     if plant.web is not None:
-        handovers["web"] = WebHandover(own, plant.name, web=plant.web)
+        handovers["web"] = WebHandover(own, str(folder.path), plant.name, web=plant.web)
     if plant.metrics is not None:
-        handovers["metrics"] = WebHandover(own, plant.name, metrics=plant.metrics)
+        handovers["metrics"] = WebHandover(own, str(folder.path), plant.name, metrics=plant.metrics)
     for name, section in plant.bridges.items():
         raw = msgspec.Raw(msgspec.json.encode(section, enc_hook=encode_value))
         handovers[name] = BridgeHandover(own, str(folder.path), plant.name, name, raw)

@@ -24,7 +24,7 @@ from eap.live.client import LiveClient
 from eap.live.view import LiveView
 from eap.runtime.durable import whole_file
 from eap.runtime.handover import WebHandover
-from eap.runtime.log import start_logging
+from eap.runtime.log import LevelFile, start_logging
 from eap.runtime.startup import LIFE_PERIOD_S, Startup
 from eap.runtime.store import plant_folder
 from eap.web.metrics import PATH, MetricsServer
@@ -47,6 +47,12 @@ def main(descriptor: int, startup: Startup) -> int:
         startup.step(str(exc))
         return 2
 
+    levels = LevelFile(Path(handover.folder))
+
+    def beat() -> None:
+        startup.beat()
+        levels.follow(section.KEY)
+
     def ready() -> None:
         startup.finish({"url": page_url(section)}, is_watched=True)
 
@@ -56,7 +62,7 @@ def main(descriptor: int, startup: Startup) -> int:
         listener,
         context,
         ready=ready,
-        beat=startup.beat,
+        beat=beat,
         parent=handover.supervisor,
     )
     return 0

@@ -6,6 +6,7 @@ import pytest
 
 from eap.control.log import AREAS
 from eap.errors import ControlError
+from eap.runtime.log import LevelFile
 from eap.services.control.log_methods import LogMethods
 
 
@@ -19,14 +20,17 @@ def loggers():
         logging.getLogger(name).setLevel(level)
 
 
-def call(method: str, **params: str) -> dict[str, str]:
-    return LogMethods().table()[method](params).levels
+@pytest.fixture
+def call(tmp_path):
+    """Call a method of an appliance that has a page and a bridge."""
+    table = LogMethods(LevelFile(tmp_path), lambda: ["web", "mqtt"]).table()
+    return lambda method, **params: table[method](params).levels
 
 
-def test_log_level_of_an_area_changes_its_lines_alone(caplog):
+def test_log_level_of_an_area_changes_its_lines_alone(call, caplog):
     assert set(call("log_levels").values()) == {"info"}
     assert call("set_log_level", level="debug", area="routing") == {
-        **dict.fromkeys(AREAS, "info"),
+        **dict.fromkeys((*AREAS, "web", "mqtt"), "info"),
         "routing": "debug",
     }
     logging.getLogger("eap.services.routing.station_router").debug("late")
@@ -34,7 +38,7 @@ def test_log_level_of_an_area_changes_its_lines_alone(caplog):
     assert [record.getMessage() for record in caplog.records] == ["late"]
 
 
-def test_log_level_of_all_areas_replaces_those_of_some():
+def test_log_level_of_all_areas_replaces_those_of_some(call):
     call("set_log_level", level="debug", area="net")
     assert set(call("set_log_level", level="warning").values()) == {"warning"}
     assert not logging.getLogger("eap.net.mqtt").isEnabledFor(logging.INFO)
@@ -45,9 +49,37 @@ def test_log_level_of_all_areas_replaces_those_of_some():
     [
         ({"level": "debug", "area": "rooting"}, "unknown area 'rooting', did you mean routing?"),
         ({"level": "debug", "area": "x"}, "known areas: ads, control, "),
+        ({"level": "debug", "area": "mqt"}, "unknown area 'mqt', did you mean mqtt?"),
         ({"level": "loud"}, "Invalid enum value 'loud'"),
     ],
 )
-def test_wrong_log_level_is_refused(params, reason):
+def test_wrong_log_level_is_refused(call, params, reason):
     with pytest.raises(ControlError, match=reason.replace("?", r"\?")):
         call("set_log_level", **params)
+
+
+def test_log_level_of_an_optional_process_is_followed_by_it_alone(call, tmp_path):
+    mqtt, logger = LevelFile(tmp_path), logging.getLogger("eap")
+    mqtt.follow("mqtt")
+    assert logger.getEffectiveLevel() == logging.INFO
+    assert call("set_log_level", level="debug", area="mqtt")["mqtt"] == "debug"
+    assert call("log_levels")["web"] == "info"
+    LevelFile(tmp_path).follow("web")
+    assert logger.level == logging.INFO
+    mqtt.follow("mqtt")
+    assert logger.level == logging.DEBUG
+    logger.setLevel(logging.ERROR)
+    mqtt.follow("mqtt")
+    assert logger.level == logging.ERROR, "an unchanged file is not read again"
+    call("set_log_level", level="warning")
+    mqtt.follow("mqtt")
+    assert logger.level == logging.WARNING
+
+
+def test_log_levels_begin_with_info_again_and_survive_a_damaged_file(call, tmp_path):
+    call("set_log_level", level="debug", area="web")
+    table = LogMethods(LevelFile(tmp_path), lambda: ["web"]).table()
+    assert table["log_levels"]({}).levels["web"] == "info"
+    (tmp_path / "log.levels").write_text("[")
+    assert table["log_levels"]({}).levels["web"] == "info"
+    LevelFile(tmp_path).follow("web")
