@@ -343,7 +343,7 @@ async def _resolve(host: str) -> str:
     try:
         found = await loop.getaddrinfo(host, AMS_TCP_PORT, family=socket.AF_INET)
     except OSError as exc:
-        raise gone(f"{host} is no host that is known here: {exc.strerror}") from None
+        raise gone(f"{host}: no such host: {exc.strerror}") from None
     return str(found[0][4][0])
 
 

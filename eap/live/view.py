@@ -179,7 +179,7 @@ class LiveView:
             if not source.has_answered():
                 yield source.name, source.why or "does not answer"
             elif source.document is None:
-                yield source.name, source.why
+                yield source.name, source.why.removeprefix(f"{source.name}: ")
 
     def _documents(self) -> list[dict[str, Any]]:
         """Return the answers; a station that several sources show is that of the first."""
