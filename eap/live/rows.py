@@ -172,7 +172,11 @@ def station_s(station: Row) -> float:
 
     Rates follow from it rather than from the time between two reports: the counters are older than
     a report by an unknown time, while the number of cycles belongs to the same moment as they do.
+    A replay has no cycles, but a position in its recording.
     """
+    if replayed := station.get("replayed"):
+        recorded_s: float = replayed["rounds"] * replayed["seconds"] + replayed["position_s"]
+        return recorded_s / float(replayed["rate"])
     cycles: int = station.get("cycle", 0) + station.get("overruns", 0)
     cycle_us: int = station.get("cycle_us", 0)
     return cycles * cycle_us / 1e6

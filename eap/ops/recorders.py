@@ -119,7 +119,12 @@ def _require_packages(options: RecorderOptions) -> None:
 def _find_plant(
     patterns: Iterable[str], plant: str | None
 ) -> tuple[ApplianceFolder, ApplianceInfo]:
-    running = [each for each in find_running() if plant in {None, each[1].plant}]
+    # A replay is found as well, but has no process images.
+    running = [
+        (folder, info)
+        for folder, info in find_running()
+        if plant in {None, info.plant} and folder.image(info.stations[0]).exists()
+    ]
     if not running:
         which = f"no plant {plant!r} runs" if plant else "no plant runs"
         raise ControlError(

@@ -106,6 +106,10 @@ class Replay:
             self._plan.add(frame)
             self._first_ns = self._first_ns or frame.at_ns
             self._last_ns = max(self._last_ns, frame.at_ns)
+        if not self._recording.published:
+            raise ConfigError(
+                f"{request.file} does not say which plant is in it: name its file with --plant"
+            )
         if not self._plan.rows:
             reasons = "; ".join(f"{name}: {why}" for name, why in self._left_out.items())
             hint = " that --only matches" if request.only else ""

@@ -27,10 +27,16 @@ from eap.control.protocol import (
     encode_result,
     request_id,
 )
-from eap.errors import ControlError
+from eap.errors import ControlError, EnvironmentalError
 from eap.recording.replay import ReplayPlan, ReplaySender
 from eap.release import RELEASE
-from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
+from eap.runtime.folder import (
+    ApplianceFolder,
+    ApplianceInfo,
+    ProcessInfo,
+    folder_name,
+    runtime_root,
+)
 
 NO_JITTER = {"p50": None, "p99": None, "max": None}
 
@@ -83,8 +89,13 @@ class ReplayStatus(Closeable):
         }
         stations = {each.station: None for each in plan.senders.values()}
         self.stations = [station_name(each) for each in stations]
+        name = folder_name(self._plant)
+        if ApplianceFolder(runtime_root() / name).is_alive():
+            raise EnvironmentalError(
+                f"a replay of {plant} runs already: end it first (eapctl status shows its file)"
+            )
         with ExitStack() as stack:
-            folder = stack.enter_context(ApplianceFolder.claim(folder_name(self._plant)))
+            folder = stack.enter_context(ApplianceFolder.claim(name))
             process = ProcessInfo(pid=os.getpid())
             started = datetime.now(UTC).isoformat(timespec="milliseconds")
             folder.write_info(

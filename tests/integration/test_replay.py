@@ -179,6 +179,12 @@ def test_status_shows_a_replay_and_stop_ends_it(kept: Kept, tmp_path: Path) -> N
         assert station["replayed"]["loop"] is True
         assert "left (replayed): replayed from" in " ".join(text.split())
         assert "pair (replay): no errors, 1 warning" in text
+        second = run_eapctl(tmp_path, "replay", str(kept.values), "--force")
+        assert (second.returncode, "a replay of pair runs already" in second.stderr) == (2, True)
+        recorded = run_eapctl(tmp_path, "record", "start", "-o", str(tmp_path / "x"))
+        assert (recorded.returncode, "no plant runs here" in recorded.stderr) == (1, True)
+        rows = run_eapctl(tmp_path, "top", "--once", "--json", "--interval", "0.5").stdout
+        assert 20 < json.loads(rows)["tx_per_s"] < 80
     finally:
         replay.send_signal(signal.SIGINT)
     out, _ = replay.communicate(timeout=30)

@@ -11,7 +11,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from eap.cli.group import main
-from tests.support.recordings import begin_values, write_frames, write_values
+from eap.recording.frames_writer import FramesWriter
+from eap.recording.header import RecordingHeader
+from tests.support.recordings import T0, begin_values, write_frames, write_values
 
 
 def run(*args: object) -> Result:
@@ -115,3 +117,10 @@ def test_export_to_a_full_disk_names_the_file(
     result = run("export", write_values(tmp_path / "a.mcap"), "--csv", "-o", tmp_path / "x.csv")
     assert result.stderr == f"{tmp_path}/x.csv: No space left on device\n"
     assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_replay_of_a_capture_needs_a_plant(tmp_path: Path) -> None:
+    writer = FramesWriter(tmp_path / "a.pcapng", RecordingHeader(plant="", host="", started_ns=T0))
+    writer.close(T0)
+    result = run("replay", tmp_path / "a.pcapng", "--dry-run")
+    assert (result.exit_code, "name its file with --plant" in result.stderr) == (2, True)
