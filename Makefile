@@ -8,6 +8,8 @@ SECONDS ?=
 ARGS ?=
 
 BIN := .venv/bin
+# A new source is compiled by installing the project again.
+COMPILED := eap/_cyclic.c tools/package/compiled.py
 
 # Where it is set, each process of an appliance would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
@@ -21,10 +23,10 @@ help:  ## list the targets
 setup: .venv/.stamp-dev  ## prepare .venv for tests and checks (once, and when pyproject.toml changes)
 
 # What runs the appliance; neither stamp depends on the other, for the second covers both.
-.venv/.stamp-run: pyproject.toml
+.venv/.stamp-run: pyproject.toml $(COMPILED)
 	@PYTHON='$(PYTHON)' sh tools/venv.sh run
 
-.venv/.stamp-dev: pyproject.toml
+.venv/.stamp-dev: pyproject.toml $(COMPILED)
 	@PYTHON='$(PYTHON)' sh tools/venv.sh dev
 
 .venv/.stamp-bench: .venv/.stamp-dev

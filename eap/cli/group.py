@@ -213,13 +213,31 @@ _COMMANDS = {
 """BusAddress of each command below ``eap.cli``, and its line in the help."""
 
 
+def _show_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
+        from importlib.metadata import version
+
+        from eap.compiled import cyclic
+
+        path = "in Python" if cyclic is None else "compiled"
+        click.echo(f"eapctl {version('eap-appliance')} (cyclic path {path})")
+        context.exit()
+
+
 @click.group(
     cls=LazyGroup,
     commands_at={name: f"eap.cli.{place}" for name, (place, _) in _COMMANDS.items()},
     summaries={name: summary for name, (_, summary) in _COMMANDS.items()},
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-@click.version_option(package_name="eap-appliance", message="eapctl %(version)s")
+@click.option(
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=_show_version,
+    help="Show the release, and whether the cyclic path is compiled.",
+)
 def main() -> None:
     """Run, configure and diagnose stations of the EtherCAT Automation Protocol (EAP).
 

@@ -377,6 +377,9 @@ def _bad_count(number: int) -> Styled:
     return Styled(str(number), style=_BAD if number else "")
 
 
+_CYCLIC_PATH = {None: "", True: " (compiled)", False: " (Python)"}
+
+
 def _processes(appliance: ApplianceStatus, label: str) -> RenderableType:
     processes = dict(appliance.processes)
     segments = list(processes.pop("segments", {}).values())
@@ -395,6 +398,8 @@ def _process(name: str, processes: Sequence[Row]) -> Styled:
         return text.append(" restarting", _BAD)
     if any(process.get("step") for process in processes):
         return text.append(" starting", _STYLES[Severity.WARNING])
+    if any(process.get("compiled") is False for process in processes):
+        text.append(_CYCLIC_PATH[False])
     if all(process.get("cpu") is not None for process in processes):
         text.append(f" {sum(process['cpu'] for process in processes):.0f} %")
     if all(process.get("rss") is not None for process in processes):
@@ -461,7 +466,7 @@ def _processes_table(appliance: ApplianceStatus) -> TextTable:
             continue
         cpu, rss = process.get("cpu"), process.get("rss")
         table.add_row(
-            name,
+            name + _CYCLIC_PATH[process.get("compiled")],
             str(process["pid"]),
             "" if cpu is None else f"{cpu:.1f} %",
             "" if rss is None else f"{rss / 1e6:.0f} MB",

@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from time import monotonic_ns
 
+from eap.compiled import cyclic
 from eap.engine.build import EnginePlant
 from eap.errors import ConfigError, EapError, EnvironmentalError
 from eap.net import realtime
@@ -176,8 +177,9 @@ def run_engine(handover: Handover, startup: Startup) -> None:
         startup.step("starting the stations")
         plant.start(monotonic_ns())
         startup.step("running the first cycle")
+        started = {"realtime": report, "compiled": cyclic is not None}
         # A program that attaches behind the ready line finds values of a cycle, not an empty image.
-        run_cycles(plant, link, stop, partial(startup.finish, {"realtime": report}))
+        run_cycles(plant, link, stop, partial(startup.finish, started))
         plant.stop()
     finally:
         plant.close()

@@ -70,6 +70,8 @@ class EthernetInterface:
         self._sock = sock
         self._batch = batch
         self._receive = batch.reader(sock.fileno())
+        self._fd = sock.fileno()
+        self._compiled = batch.compiled()
         self._octets = batch.octets
         self._heads = batch.octets.cast("Q")
         self._tags = batch.control.cast("H")
@@ -139,13 +141,18 @@ class EthernetInterface:
     def drain(self) -> int:
         """Hand every waiting frame to the ports it is for; return how many were handed over."""
         total = self._drain_local() if self._local else 0
+        if self._compiled is not None and not self._binding.is_lost:
+            count: int = self._compiled.drain(
+                self._fd, self._routes, self._find_handlers, self, self._note_error
+            )
+            return total + count
         for _ in range(_BATCHES_PER_DRAIN):
             count = self._receive()
             if count == 1:
                 return total + self._dispatch_one()
             if count < 0:
                 if self._binding.is_lost or get_errno() != EAGAIN:
-                    self._note_error()
+                    self._note_error(get_errno())
                 break
             total += self._dispatch(count)
             if count < BATCH:
@@ -220,12 +227,19 @@ class EthernetInterface:
         """Close the socket."""
         self._sock.close()
 
-    def _note_error(self) -> None:
-        if get_errno() == ENETDOWN:
+    def _note_error(self, number: int) -> bool:
+        """Note why nothing was received; return False, for nothing waits behind it."""
+        if number == ENETDOWN:
             # Once, for switched off as for deleted.
             self._binding.is_lost = True
-        note_receive_error(self.errors)
+        note_receive_error(self.errors, number)
         self.find()
+        return False
+
+    def _find_handlers(self, position: int) -> Sequence[FrameHandler]:
+        """Return the handlers of the frame at *position* in the batch, as :meth:`_handlers`."""
+        head = self._heads[position * (BUFFER_SIZE // 8)]
+        return self._handlers(head, self._tags[position * (_CONTROL_SIZE // 2) + _TCI])
 
     def _dispatch_one(self) -> int:
         handlers = self._handlers(self._heads[0], self._tags[_TCI])

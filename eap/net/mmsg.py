@@ -14,7 +14,9 @@ import struct
 from collections.abc import Callable, Sequence
 from functools import partial
 from time import monotonic_ns, time_ns
+from typing import Any
 
+from eap.compiled import cyclic
 from eap.pd.link import OutFrame
 
 ICMP_ERRNOS = frozenset(
@@ -64,12 +66,14 @@ def count_error(errors: dict[str, int], number: int | None) -> None:
     errors[name] = errors.get(name, 0) + 1
 
 
-def note_receive_error(errors: dict[str, int]) -> bool:
+def note_receive_error(errors: dict[str, int], number: int | None = None) -> bool:
     """Count why the last receive call returned -1, unless there was just nothing to receive.
 
-    Return True if the error belongs to an earlier datagram: then messages may still be waiting.
+    *number* is the errno of a call that was not made by :meth:`ReceiveBatch.reader`.  Return True
+    if the error belongs to an earlier datagram: then messages may still be waiting.
     """
-    number = ctypes.get_errno()
+    if number is None:
+        number = ctypes.get_errno()
     if number in ICMP_ERRNOS:
         return True
     if number not in (errno.EAGAIN, errno.EINTR):
@@ -95,6 +99,9 @@ class ReceiveBatch:
         self, control_size: int = STAMP_SIZE, headroom: int = 0, *, with_senders: bool = True
     ) -> None:
         self._control_size = control_size
+        self._headroom = headroom
+        self._with_senders = with_senders
+        self._compiled: Any = None
         self._buffers = bytearray(BATCH * BUFFER_SIZE)
         self._control = bytearray(BATCH * control_size)
         self._senders = bytearray(BATCH * _SOCKADDR_SIZE)
@@ -128,6 +135,24 @@ class ReceiveBatch:
         """Return the call that fills the batch from *fd* and returns how many came, or -1."""
         headers = ctypes.c_void_p(_address(self._headers))
         return partial(_recvmmsg, fd, headers, BATCH, socket.MSG_DONTWAIT, None)
+
+    def compiled(self) -> Any:
+        """Return the compiled receiver of this memory; None without compiled part.
+
+        Its ``drain`` does what the channels of this package do by :meth:`reader`, and calls
+        compiled handlers without a detour.
+        """
+        if self._compiled is None and cyclic is not None:
+            self._compiled = cyclic.Receiver(
+                self._headers,
+                self.octets,
+                self._control,
+                self._senders if self._with_senders else None,
+                self._control_size,
+                self._headroom,
+                self.views,
+            )
+        return self._compiled
 
     def arrival(self) -> tuple[memoryview, int, int]:
         """Return view, whole size and monotonic arrival time of the only message of a batch."""

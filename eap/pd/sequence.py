@@ -108,9 +108,22 @@ class SequenceTracker:
             self.forget_sender()
 
     @property
-    def state(self) -> RxState:
-        """State of the subscriptions of this tracker."""
-        return RxState(self._words[_STATE])
+    def is_running(self) -> bool:
+        """True if the subscriptions of this tracker are in state RUNNING."""
+        return bool(self._words[_STATE] == _RUNNING)
+
+    @property
+    def timing_numbers(self) -> tuple[int, ...]:
+        """Its first word and the numbers that :meth:`arrived` computes with; for compiled plans."""
+        return (
+            self.first_word + TRACKER_START,
+            self._usual_gap,
+            self._usual_ns,
+            self._wrap_ns,
+            self._step,
+            0 if self._timing.polled else self._sender_cycle_ns,
+            self._own_cycle_ns,
+        )
 
     @property
     def arrived_at_ns(self) -> int:

@@ -123,11 +123,14 @@ class Station:
             for subscriber in self._subscribers.values()
             if subscriber.has_timeouts
         ]
-        self.handlers: dict[str, FrameHandler] = {
-            name: subscriber.receive_frame for name, subscriber in self._subscribers.items()
+        self._learners = {
+            port: NetIdLearner(self._subscribers[port].receive_frame)
+            for port in _learning_ports(spec)
         }
-        self._learners = {port: NetIdLearner(self.handlers[port]) for port in _learning_ports(spec)}
-        self.handlers.update((port, learner.handle) for port, learner in self._learners.items())
+        self.handlers: dict[str, FrameHandler] = {
+            name: subscriber.make_handler(self._learners.get(name))
+            for name, subscriber in self._subscribers.items()
+        }
 
     def _subscriber(self, port: str) -> Subscriber:
         rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)

@@ -7,14 +7,15 @@ from the frame straight into the process image; state and counters live there to
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping
+import weakref
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import CYCLE_OFFSET, EAP_SM_OFFSET, FIRST_PD, PD_FRAME_START, PdHeader
 from eap.ids import NetId
-from eap.pd.address import SourceWatch
+from eap.pd.address import NetIdLearner, SourceWatch
 from eap.pd.authentication import (
     SIGNATURE_FAULTS,
     KeyRing,
@@ -22,9 +23,10 @@ from eap.pd.authentication import (
     find_signature,
     is_signature,
 )
+from eap.pd.compiledplan import compile_handler
 from eap.pd.image import Image
 from eap.pd.layout import RxSlot
-from eap.pd.link import FrameOrigin
+from eap.pd.link import FrameHandler, FrameOrigin
 from eap.pd.poll import OutgoingPoll, PollRequests
 from eap.pd.sequence import SequenceTracker, Timing
 from eap.pd.spec import Authentication, RxPdSpec
@@ -39,7 +41,7 @@ from eap.pd.subscription import (
     walk,
     walk_by_pds,
 )
-from eap.pd.words import PD_DROP_INDEX, PdDropReason, RxState, RxWord, StationWord
+from eap.pd.words import PD_DROP_INDEX, PdDropReason, RxWord, StationWord
 
 _KEY = struct.Struct("<10s3x7s").unpack_from
 """EtherCAT header, publisher and count; EAP SM and the header of the first PD: key of a layout.
@@ -58,6 +60,10 @@ NO_KEYS = KeyRing()
 
 _CYCLE = int(StationWord.CYCLE)
 _SEQUENCE = int(StationWord.ENGINE_SEQUENCE)
+
+
+def _no_handler() -> None:
+    """Return no compiled handler."""
 
 
 class Subscriber:
@@ -87,6 +93,7 @@ class Subscriber:
         lenient: bool = False,
         keys: KeyRing = NO_KEYS,
     ) -> None:
+        self._compiled: Callable[[], Any] = _no_handler
         self._table = SubscriptionTable(
             image, subscriptions, own_cycle_ns, requests, polls, lenient=lenient, keys=keys
         )
@@ -94,9 +101,26 @@ class Subscriber:
         self._closed_reason = PdDropReason.SUPPRESSED
         self._next_timeout_ns = _NEVER
 
+    def make_handler(self, learner: NetIdLearner | None = None) -> FrameHandler:
+        """Return the handler of the port's frames: the compiled part, with Python behind it.
+
+        Args:
+            learner: Looks at the frames first, and hands them to :meth:`receive_frame`.
+        """
+        handle = self.receive_frame if learner is None else learner.handle
+        compiled: FrameHandler | None = compile_handler(handle, learner)
+        if compiled is None:
+            return handle
+        # A reference to what refers to this object would make a cycle, which is never freed as
+        # long as the collector is off.
+        self._compiled = weakref.ref(compiled)
+        self._follow()
+        return compiled
+
     def open(self, from_ns: int) -> None:
         """Take what arrives from now on; what arrived earlier is stale (the station is in Op)."""
         self._open_from_ns = from_ns
+        self._follow()
         self._closed_reason = PdDropReason.STALE
         self._next_timeout_ns = from_ns
 
@@ -109,8 +133,16 @@ class Subscriber:
     def close(self) -> None:
         """Stop receiving: the station left Op."""
         self._open_from_ns = _NEVER
+        self._follow()
         self._closed_reason = PdDropReason.SUPPRESSED
         self._next_timeout_ns = _NEVER
+
+    def _follow(self) -> None:
+        """Have the compiled handler use the present table and time."""
+        handler, table = self._compiled(), self._table
+        if handler is not None:
+            handler.open_from_ns = self._open_from_ns
+            handler.attach(table.plans, table.memory, table.words)
 
     def learn_from(self, before: Subscriber) -> None:
         """Plan for all layouts of frames that *before* knows, so that none is new."""
@@ -122,6 +154,8 @@ class Subscriber:
         Whether this one is open stays as it is.
         """
         self._table, after._table = after._table, self._table
+        self._follow()
+        after._follow()
         if self._open_from_ns != _NEVER:
             # What is new, or has another time-out now, has at least that long.
             following_ns = now_ns + self._table.shortest_timeout_ns
@@ -129,6 +163,8 @@ class Subscriber:
 
     def release(self) -> None:
         """Free all subscriptions one by one."""
+        if (handler := self._compiled()) is not None:
+            handler.detach()
         self._table.release()
 
     def receive_frame(self, data: memoryview, size: int, at_ns: int, origin: FrameOrigin) -> None:
@@ -187,7 +223,7 @@ class Subscriber:
             timeout_ns, tracker = subscription.timeout_ns, subscription.tracker
             if not timeout_ns:
                 continue
-            if tracker.state is not RxState.RUNNING:
+            if not tracker.is_running:
                 # It may start to run at any moment, and then has this long.
                 following = min(following, now_ns + timeout_ns)
                 continue
@@ -232,6 +268,7 @@ class SubscriptionTable:
     Attributes:
         memory: Of the image.
         words: Of the image.
+        plans: Of all layouts that are known, by key.
         subscriptions: All of them.
         shortest_timeout_ns: Of theirs; never if they have none.
     """
@@ -266,7 +303,7 @@ class SubscriptionTable:
         timeouts = [s.timeout_ns for s in self.subscriptions if s.timeout_ns]
         self.shortest_timeout_ns = min(timeouts, default=_NEVER)
         self._sources = frozenset(s.source for s in self.subscriptions if s.source)
-        self._plans: dict[tuple[bytes, bytes], list[FramePlan]] = {}
+        self.plans: dict[tuple[bytes, bytes], list[FramePlan]] = {}
         self._watches: dict[tuple[bytes, bytes], SourceWatch] = {}
         self._pds_planned = 0
         self._open_trackers(own_cycle_ns)
@@ -275,7 +312,7 @@ class SubscriptionTable:
         """Plan for all layouts of frames that *before* knows, so that none is new."""
         # Copies: the running cycle may learn a layout while the thread that rebuilds reads the
         # tables.
-        for plans in list(before._plans.values()):
+        for plans in list(before.plans.values()):
             for plan in list(plans):
                 if plan.has_wrong_length and not self._lenient:
                     continue  # learning it would count a dropped frame that never came
@@ -283,7 +320,7 @@ class SubscriptionTable:
 
     def release(self) -> None:
         """Free all subscriptions one by one: freeing many at once would delay the cycles."""
-        for container in (self._by_key, self._by_id, self._plans, self._watches):
+        for container in (self._by_key, self._by_id, self.plans, self._watches):
             while container:
                 container.popitem()
         while self.subscriptions:
@@ -292,7 +329,7 @@ class SubscriptionTable:
     def find_plan(self, data: memoryview, size: int, source: bytes, at_ns: int) -> FramePlan | None:
         """Return the plan of a frame's layout, None if it is not known yet."""
         if size >= _SHORTEST:
-            for plan in self._plans.get(_KEY(data), ()):
+            for plan in self.plans.get(_KEY(data), ()):
                 if plan.end <= size and (
                     plan.is_single or plan.headers(data, FIRST_PD) == plan.expected
                 ):
@@ -336,7 +373,7 @@ class SubscriptionTable:
         if self._pds_planned > _PDS_PLANNED:
             self._forget_plans()
         self._pds_planned += (1 + len(pds)) * plan.alternatives
-        same_key = self._plans.setdefault(_KEY(data), [])
+        same_key = self.plans.setdefault(_KEY(data), [])
         # Bounded: a sender could otherwise fill the memory with invented layouts.
         if len(same_key) >= _PLANS_PER_KEY:
             same_key.clear()
@@ -420,7 +457,7 @@ class SubscriptionTable:
         return watch
 
     def _forget_plans(self) -> None:
-        self._plans.clear()
+        self.plans.clear()
         self._watches.clear()
         self._pds_planned = 0
 

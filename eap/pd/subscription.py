@@ -17,6 +17,7 @@ from eap.errors import CodecError, TruncatedError
 from eap.ids import NetId
 from eap.pd.address import SourceWatch, source_octets
 from eap.pd.authentication import SignatureCheck
+from eap.pd.compiledplan import compile_plan
 from eap.pd.copyplan import CopyPlan
 from eap.pd.image import Image, default_value, put
 from eap.pd.layout import RxSlot
@@ -187,6 +188,7 @@ class FramePlan:
         signature: Check of the frame's signature, with the plans of frames that it refuses, by
             reason; None if no subscription wants it.
         has_checks: Whether there is anything of the last two.
+        fast: The same for the compiled part; None if it leaves such frames to Python.
         publisher: The frame's, as a number.
         watch: The addresses that such frames come from; it belongs to this plan if they do.
     """
@@ -198,6 +200,7 @@ class FramePlan:
         "any_publisher",
         "end",
         "expected",
+        "fast",
         "has_checks",
         "has_more",
         "head",
@@ -251,6 +254,13 @@ class FramePlan:
         self.has_checks = bool(self.any_publisher) or signature is not None
         self.publisher = int.from_bytes(head.publisher)
         self.watch = watch
+        self.fast = compile_plan(self)
+
+    @property
+    def is_usual(self) -> bool:
+        """True if a frame of this layout changes nothing but trackers, data and counters."""
+        more = (self.has_checks, self.alternates, self.requests, self.answers, self.head.eap_sm)
+        return not any(more) and not any(pd.mismatches or pd.wrong_source for pd in self.refused)
 
     @property
     def alternatives(self) -> int:

@@ -125,10 +125,11 @@ class Receiver:
             lenient=self.lenient,
             keys=self.keys,
         )
+        self.handle = self.subscriber.make_handler()
         self.subscriber.open(now_ns)
 
     def give(self, frame: bytes, at_ns: int, source: bytes = b"") -> None:
-        give(self.subscriber.receive_frame, frame, at_ns, source=source)
+        give(self.handle, frame, at_ns, source=source)
 
     def slot(self, name: str) -> RxSlot:
         return next(slot for slot in self.image.layout.rx if slot.name == name)

@@ -147,6 +147,7 @@ def appliance_status(
     now_ns = clock_gettime_ns(CLOCK_BOOTTIME)
     engine = _process(info.engine, meter, now_ns)
     engine["realtime"] = info.engine.report.get("realtime", {})
+    engine["compiled"] = info.engine.report.get("compiled")
     if report := next(iter(buses.values()), None):
         engine["bus_requests"] = {"malformed": report.malformed, "dropped": report.dropped}
     processes = {

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -70,7 +71,14 @@ def test_debug_shows_where(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_exit_code_of_a_command_is_kept() -> None:
     assert CliRunner().invoke(failing(click.exceptions.Exit(2)), ["x"]).exit_code == 2
-    assert CliRunner().invoke(main, ["--version"]).exit_code == ExitCode.DONE
+
+
+@pytest.mark.parametrize(("module", "path"), [(None, "in Python"), (object(), "compiled")])
+def test_version_says_whether_the_cyclic_path_is_compiled(module, path, monkeypatch):
+    monkeypatch.setattr("eap.compiled.cyclic", module)
+    result = CliRunner().invoke(main, ["--version"])
+    assert result.exit_code == ExitCode.DONE
+    assert re.fullmatch(rf"eapctl \S+ \(cyclic path {path}\)\n", result.stdout)
 
 
 def test_usage_errors_name_the_command() -> None:

@@ -41,6 +41,13 @@ def test_processes_and_stations() -> None:
     assert "Since the start" not in text
 
 
+@pytest.mark.parametrize(("compiled", "shown"), [(True, "(compiled)"), (False, "(Python)")])
+def test_engine_says_whether_its_cyclic_path_is_compiled(compiled: bool, shown: str) -> None:
+    status = document()
+    status["processes"]["engine"]["compiled"] = compiled
+    assert row_of(show(status), "engine") == f"engine {shown} 101 4.2 % 35 MB 0"
+
+
 @pytest.mark.parametrize("state", ["PREOP", "SAFEOP"])
 def test_pds_that_the_state_of_the_station_leaves_out_are_off(state: str) -> None:
     shown = show(document(state=state, tx=[tx("speed")], rx=[rx("left")]))

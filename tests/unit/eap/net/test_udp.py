@@ -97,7 +97,7 @@ def test_unreachable_destination_is_counted_not_raised(channels):
 
 def test_broken_socket_is_counted_not_raised(channels):
     sender, receiver = channels
-    receiver._receive = receiver._batch.reader(-1)
+    receiver._receive, receiver._fd = receiver._batch.reader(-1), -1
     assert receiver.drain(0) == 0
     assert receiver.errors == {"EBADF": 1}
     assert sender.fileno() != receiver.fileno()

@@ -99,7 +99,7 @@ def test_the_document_has_the_shape_of_the_contract(files, monkeypatch):
         ["left", "right"],
         "2026-01-01T00:00:00+00:00",
         os.getpid(),
-        ProcessInfo(os.getpid(), 2, {"realtime": {"scheduler": "fifo 50"}}),
+        ProcessInfo(os.getpid(), 2, {"realtime": {"scheduler": "fifo 50"}, "compiled": True}),
         ProcessInfo(0, 1),
     )
     images = [file.image for file in files.values()]
@@ -114,6 +114,7 @@ def test_the_document_has_the_shape_of_the_contract(files, monkeypatch):
     assert processes["supervisor"]["pid"] == os.getpid()
     assert processes["engine"]["restarts"] == 2
     assert processes["engine"]["realtime"] == {"scheduler": "fifo 50"}
+    assert processes["engine"]["compiled"] is True
     assert processes["services"] == {"pid": None, **status.NOTHING_MEASURED, "restarts": 1}
     assert document["listeners"] == [
         {

@@ -1,0 +1,851 @@
+/* Compiled part of the cyclic path: frames of known layouts, from the socket to the process image.
+
+   eap/pd/subscriber.py and eap/net/mmsg.py are the reference.  Everything that is not the usual case
+   is left to them: an unknown or a forgotten layout, another source address, a station that does not
+   receive, signatures, polls, alternates, EAP SM, lost or reordered frames.  This file decides that
+   before it changes anything, so each frame is handled by one of the two alone.  It keeps no state
+   of its own but the offset of two clocks: plans, trackers and counters are those of Python.
+
+   Limited API of CPython 3.11.  The GIL is held throughout: no call blocks, and a cycle that gave it
+   up would have to wait for the thread that prepares a change.  */
+
+#define _GNU_SOURCE
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+#include <structmember.h>
+
+#include <errno.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <time.h>
+
+/* Parameters, plans and offsets as eap/pd/compiled.py gives them; raised when either side changes. */
+#define API 1
+
+/* Offsets in a frame, and of words in the image: OFFSETS has those that Python compares. */
+enum { CYCLE_AT = 10, SM_AT = 13, FIRST_PD = 14, PD_HEADER = 8, PD_COMPARED = 6, PD_LENGTH = 4 };
+enum { KEY_HEAD = 10, KEY_TAIL = 7, SHORTEST = FIRST_PD + PD_HEADER };
+enum { STATION_CYCLE = 0, STATION_SEQUENCE = 4 };
+enum { RECEIVED, DUPLICATED, REORDERED, LATE, STATE = 7, LAST_CYCLE, ARRIVED_AT_NS,
+       ARRIVED_IN_CYCLE, BEHIND, JITTER_MAX_US = 15, JITTER, BINS = 64,
+       TRACKER_WORDS = JITTER + BINS };
+enum { RUNNING = 1, NEAR = 0x3FFF };
+enum { WORD = sizeof(int64_t), MAX_INDEX = 1 << 30, MAX_BATCHES = 4 };
+#define BILLION 1000000000LL
+#define CLOCK_NOISE_NS 1000
+/* Times and periods that are computed with: far below an overflow of their sums and products. */
+#define MAX_NS (1LL << 61)
+
+typedef enum { LEFT_TO_PYTHON, TAKEN, FAILED = -1 } Result;
+
+static PyObject *text_fast, *text_source, *text_source_of, *text_wanted;
+
+/* A word has one writer; readers in other processes copy without a lock. */
+static int64_t load(const int64_t *word) { return __atomic_load_n(word, __ATOMIC_RELAXED); }
+
+static void store(int64_t *word, int64_t value) { __atomic_store_n(word, value, __ATOMIC_RELAXED); }
+
+static void add(int64_t *word, int64_t more)
+{
+    store(word, (int64_t)((uint64_t)load(word) + (uint64_t)more));
+}
+
+static void release_buffer(Py_buffer *buffer)
+{
+    PyBuffer_Release(buffer);
+    memset(buffer, 0, sizeof *buffer);  /* nothing may be read there any more */
+}
+
+/* ---- Plan: what becomes of the frames of one layout ---- */
+
+typedef struct {
+    int64_t source, target, size;
+} Copy;
+
+/* A tracker with its copies, one behind the other as pd.compiled packs them. */
+typedef struct {
+    int64_t first;  /* index of the tracker's first word */
+    int64_t usual_gap, usual_ns, wrap_ns, step, sender_cycle_ns, own_cycle_ns, copies;
+    Copy copy[];
+} Part;
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *watch;
+    Py_ssize_t end, header_size, part_size, counter_size;
+    int64_t words_needed, memory_needed;
+    uint8_t *headers;  /* of all PDs, without quality */
+    char *parts;
+    int64_t *counters;
+} Plan;
+
+static PyTypeObject *plan_type, *handler_type, *receiver_type;
+
+/* Free the memory of an object of ours; its parts are gone. */
+static void free_object(PyObject *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyObject *make_object(PyTypeObject *type, PyObject *keywords)
+{
+    if (keywords != NULL && PyDict_Size(keywords))
+        return PyErr_Format(PyExc_TypeError, "there are no keywords");
+    return ((allocfunc)PyType_GetSlot(type, Py_tp_alloc))(type, 0);
+}
+
+static int refuse(const char *what)
+{
+    PyErr_SetString(PyExc_ValueError, what);
+    return -1;
+}
+
+static void plan_dealloc(Plan *self)
+{
+    Py_XDECREF(self->watch);
+    PyMem_Free(self->headers);
+    PyMem_Free(self->parts);
+    PyMem_Free(self->counters);
+    free_object((PyObject *)self);
+}
+
+/* Return a copy of *octets* that is aligned for words. */
+static void *copy_of(const char *octets, Py_ssize_t size)
+{
+    void *copy = PyMem_Malloc((size_t)size + 1);
+    if (copy == NULL)
+        PyErr_NoMemory();
+    else
+        memcpy(copy, octets, (size_t)size);
+    return copy;
+}
+
+static Py_ssize_t pd_size(const uint8_t *header)
+{
+    return PD_HEADER + (header[PD_LENGTH] | header[PD_LENGTH + 1] << 8);
+}
+
+static int need(int64_t *needed, int64_t first, int64_t count)
+{
+    if (first < 0 || count < 0 || first > MAX_INDEX || count > MAX_INDEX)
+        return refuse("a plan reaches outside of the image");
+    if (first + count > *needed)
+        *needed = first + count;
+    return 0;
+}
+
+static int is_time(int64_t ns) { return ns >= 0 && ns <= MAX_NS; }
+
+/* Check all that the plan says before it is used for a frame. */
+static int plan_check(Plan *self)
+{
+    Py_ssize_t at = FIRST_PD, rest = self->part_size;
+    for (Py_ssize_t n = 0; n < self->header_size; n += PD_COMPARED)
+        at += pd_size(self->headers + n);
+    if (at > self->end || self->end > MAX_INDEX)
+        return refuse("a PD of a plan lies behind the end of its frame");
+    for (char *place = self->parts; rest; ) {
+        const Part *part = (Part *)place;
+        if (rest < (Py_ssize_t)sizeof(Part) || part->copies < 0
+            || part->copies > (rest - (Py_ssize_t)sizeof(Part)) / (Py_ssize_t)sizeof(Copy))
+            return refuse("a plan is cut off");
+        if (!is_time(part->usual_ns) || !is_time(part->own_cycle_ns) || part->wrap_ns < 0
+            || part->usual_gap < -1 || !is_time(part->step) || part->sender_cycle_ns < 0
+            || part->sender_cycle_ns > MAX_NS >> 16)
+            return refuse("a time of a plan is too long");
+        if (need(&self->words_needed, part->first, TRACKER_WORDS))
+            return -1;
+        for (int64_t n = 0; n < part->copies; n++) {
+            const Copy *copy = &part->copy[n];
+            if (need(&self->memory_needed, copy->target, copy->size))
+                return -1;
+            if (copy->source < 0 || copy->source > self->end - copy->size)
+                return refuse("a copy of a plan lies behind the end of its frame");
+        }
+        Py_ssize_t size = (Py_ssize_t)(sizeof(Part) + (size_t)part->copies * sizeof(Copy));
+        place += size;
+        rest -= size;
+    }
+    for (Py_ssize_t n = 0; n < self->counter_size / WORD; n++)
+        if (need(&self->words_needed, self->counters[n], 1))
+            return -1;
+    return 0;
+}
+
+static PyObject *plan_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
+{
+    const char *headers, *parts, *counters;
+    PyObject *watch;
+    Plan *self = (Plan *)make_object(type, keywords);
+    if (self == NULL)
+        return NULL;
+    self->words_needed = STATION_SEQUENCE + 1;
+    if (!PyArg_ParseTuple(args, "ny#y#y#O", &self->end, &headers, &self->header_size, &parts,
+                          &self->part_size, &counters, &self->counter_size, &watch))
+        goto failed;
+    if (!self->header_size || self->header_size % PD_COMPARED || self->counter_size % WORD) {
+        refuse("a plan is cut off");
+        goto failed;
+    }
+    Py_INCREF(watch);
+    self->watch = watch;
+    if ((self->headers = copy_of(headers, self->header_size)) != NULL
+        && (self->parts = copy_of(parts, self->part_size)) != NULL
+        && (self->counters = copy_of(counters, self->counter_size)) != NULL && !plan_check(self))
+        return (PyObject *)self;
+failed:
+    Py_DECREF(self);
+    return NULL;
+}
+
+static const Part *next_part(const Part *part)
+{
+    return (const Part *)(part->copy + part->copies);
+}
+
+static const Part *first_part(const Plan *plan) { return (const Part *)plan->parts; }
+
+static const Part *end_of_parts(const Plan *plan)
+{
+    return (const Part *)(plan->parts + plan->part_size);
+}
+
+static int plan_matches(const Plan *self, const uint8_t *data, Py_ssize_t size)
+{
+    Py_ssize_t at = FIRST_PD;
+    if (self->end > size)
+        return 0;
+    for (Py_ssize_t n = 0; n < self->header_size; n += PD_COMPARED) {
+        if (memcmp(data + at, self->headers + n, PD_COMPARED))
+            return 0;
+        at += pd_size(self->headers + n);
+    }
+    return 1;
+}
+
+/* ---- SequenceTracker, the usual cases of arrived() ---- */
+
+/* Whether *part* takes a frame as arrived() does without a loss, a reorder or a wrap. */
+static int is_usual(const Part *part, const int64_t *words, int cycle, int64_t at_ns)
+{
+    int64_t last = load(&words[part->first + LAST_CYCLE]);
+    int64_t before_ns = load(&words[part->first + ARRIVED_AT_NS]);
+    if (last < 0)
+        return 1;
+    if (last > MAX_NS || !is_time(before_ns))
+        return 0;
+    int64_t elapsed_ns = at_ns - before_ns, gap = (cycle - last) & 0xFFFF;
+    if (elapsed_ns > part->wrap_ns)
+        return 0;
+    return gap == part->usual_gap || (gap <= NEAR && !(part->step && gap >= 2 * part->step));
+}
+
+static int bin_of(int64_t micros)
+{
+    if (micros < 4)
+        return (int)micros;
+    int exponent = 64 - __builtin_clzll((unsigned long long)micros);
+    if (exponent > 17)
+        return BINS - 1;
+    return 4 * (exponent - 2) + (int)(micros >> (exponent - 3) & 3);
+}
+
+static void enter_jitter(const Part *part, int64_t *tracker, int64_t deviation_ns)
+{
+    if (deviation_ns > part->own_cycle_ns)
+        add(&tracker[LATE], 1);
+    int64_t micros = (deviation_ns < 0 ? -deviation_ns : deviation_ns) / 1000;
+    add(&tracker[JITTER + bin_of(micros)], 1);
+    if (micros > load(&tracker[JITTER_MAX_US]))
+        store(&tracker[JITTER_MAX_US], micros);
+}
+
+static void arrived(const Part *part, int64_t *words, int cycle, int64_t at_ns, int64_t own_cycle)
+{
+    int64_t *tracker = words + part->first;
+    int64_t last = load(&tracker[LAST_CYCLE]), position = cycle;
+    if (last >= 0) {
+        int64_t elapsed_ns = at_ns - load(&tracker[ARRIVED_AT_NS]), gap = (cycle - last) & 0xFFFF;
+        if (gap == part->usual_gap)
+            enter_jitter(part, tracker, elapsed_ns - part->usual_ns);
+        else if (gap == 0)
+            add(&tracker[DUPLICATED], 1);
+        else if (part->sender_cycle_ns)
+            enter_jitter(part, tracker, elapsed_ns - gap * part->sender_cycle_ns);
+        position = last + gap;
+    }
+    add(&tracker[RECEIVED], 1);
+    store(&tracker[STATE], RUNNING);
+    store(&tracker[LAST_CYCLE], position);
+    store(&tracker[ARRIVED_AT_NS], at_ns);
+    store(&tracker[ARRIVED_IN_CYCLE], own_cycle);
+    store(&tracker[BEHIND], 0);
+}
+
+/* ---- PortHandler: receive_frame() of one port ---- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *fallback, *learner, *plans, *weak_references;
+    Py_buffer memory, words;
+    long long open_from_ns;
+} PortHandler;
+
+static int handler_clear(PortHandler *self)
+{
+    Py_CLEAR(self->plans);
+    release_buffer(&self->memory);
+    release_buffer(&self->words);
+    Py_CLEAR(self->fallback);
+    Py_CLEAR(self->learner);
+    return 0;
+}
+
+static int handler_traverse(PortHandler *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE((PyObject *)self));
+    Py_VISIT(self->fallback);
+    Py_VISIT(self->learner);
+    Py_VISIT(self->plans);
+    /* Not the memory: it refers to nothing, and CPython must not clear a view that is in use. */
+    return 0;
+}
+
+static void handler_dealloc(PortHandler *self)
+{
+    PyObject_GC_UnTrack(self);
+    if (self->weak_references != NULL)
+        PyObject_ClearWeakRefs((PyObject *)self);
+    handler_clear(self);
+    free_object((PyObject *)self);
+}
+
+static PyObject *handler_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
+{
+    PyObject *fallback, *learner;
+    if (!PyArg_ParseTuple(args, "OO", &fallback, &learner))
+        return NULL;
+    PortHandler *self = (PortHandler *)make_object(type, keywords);
+    if (self != NULL) {
+        Py_INCREF(fallback);
+        self->fallback = fallback;
+        Py_INCREF(learner);
+        self->learner = learner;
+        self->open_from_ns = INT64_MAX;
+    }
+    return (PyObject *)self;
+}
+
+static PyObject *handler_attach(PortHandler *self, PyObject *args)
+{
+    PyObject *plans, *memory, *words;
+    Py_buffer new_memory = {0}, new_words = {0};
+    if (!PyArg_ParseTuple(args, "O!OO", &PyDict_Type, &plans, &memory, &words))
+        return NULL;
+    if (PyObject_GetBuffer(memory, &new_memory, PyBUF_CONTIG)
+        || PyObject_GetBuffer(words, &new_words, PyBUF_CONTIG))
+        goto failed;
+    if ((uintptr_t)new_words.buf % WORD) {
+        refuse("the words of an image are aligned");
+        goto failed;
+    }
+    PyObject *before = self->plans;
+    Py_INCREF(plans);
+    self->plans = plans;
+    release_buffer(&self->memory);
+    release_buffer(&self->words);
+    self->memory = new_memory;
+    self->words = new_words;
+    Py_XDECREF(before);
+    Py_RETURN_NONE;
+failed:
+    release_buffer(&new_memory);
+    release_buffer(&new_words);
+    return NULL;
+}
+
+static PyObject *handler_detach(PortHandler *self, PyObject *nothing)
+{
+    (void)nothing;
+    handler_clear(self);
+    Py_RETURN_NONE;
+}
+
+/* Return whether the learner of addresses wants to see frames; -1 for an error. */
+static int is_learning(PortHandler *self)
+{
+    if (self->learner == NULL || self->learner == Py_None)
+        return 0;
+    PyObject *wanted = PyObject_GetAttr(self->learner, text_wanted);
+    int result = wanted == NULL ? -1 : PyObject_IsTrue(wanted);
+    Py_XDECREF(wanted);
+    return result;
+}
+
+/* Return the plans of the frames with the key of *data*; NULL if there are none. */
+static PyObject *plans_of(PortHandler *self, const uint8_t *data)
+{
+    PyObject *key = Py_BuildValue("(y#y#)", (const char *)data, (Py_ssize_t)KEY_HEAD,
+                                  (const char *)data + SM_AT, (Py_ssize_t)KEY_TAIL);
+    PyObject *plans = key == NULL ? NULL : PyDict_GetItemWithError(self->plans, key);
+    Py_XINCREF(plans);
+    Py_XDECREF(key);
+    return plans;
+}
+
+/* Return whether the frames of *plan* come from *source* as before; -1 for an error. */
+static int comes_from(const Plan *plan, const uint8_t *source, Py_ssize_t size)
+{
+    PyObject *known = PyObject_GetAttr(plan->watch, text_source);
+    if (known == NULL)
+        return -1;
+    int same = PyBytes_Check(known) && PyBytes_Size(known) == size
+               && !memcmp(PyBytes_AsString(known), source, (size_t)size);
+    Py_DECREF(known);
+    return same;
+}
+
+/* Return the plan of a frame; NULL if Python has to look, or for an error. */
+static Plan *find_plan(PortHandler *self, const uint8_t *data, Py_ssize_t size,
+                       const uint8_t *source, Py_ssize_t source_size)
+{
+    PyObject *plans = plans_of(self, data), *found = NULL;
+    Py_ssize_t count = plans != NULL && PyList_Check(plans) ? PyList_Size(plans) : 0;
+    for (Py_ssize_t n = 0; found == NULL && n < count; n++) {
+        PyObject *each = PyList_GetItem(plans, n);
+        found = each == NULL ? NULL : PyObject_GetAttr(each, text_fast);
+        if (found == NULL)
+            break;
+        /* A plan that Python alone carries out may come first. */
+        if (!Py_IS_TYPE(found, plan_type)) {
+            Py_CLEAR(found);
+            break;
+        }
+        if (!plan_matches((Plan *)found, data, size))
+            Py_CLEAR(found);
+    }
+    Py_XDECREF(plans);
+    if (found != NULL && comes_from((Plan *)found, source, source_size) != 1)
+        Py_CLEAR(found);
+    return (Plan *)found;
+}
+
+/* Take a frame, of which all *size* bytes are there, if it is a usual one. */
+static Result take(PortHandler *self, const uint8_t *data, Py_ssize_t size, int64_t at_ns,
+                   const uint8_t *source, Py_ssize_t source_size)
+{
+    if (self->plans == NULL || size < SHORTEST || at_ns < self->open_from_ns || !is_time(at_ns))
+        return LEFT_TO_PYTHON;
+    int learning = is_learning(self);
+    if (learning)
+        return learning < 0 ? FAILED : LEFT_TO_PYTHON;
+    Plan *plan = find_plan(self, data, size, source, source_size);
+    if (plan == NULL)
+        return PyErr_Occurred() ? FAILED : LEFT_TO_PYTHON;
+    int64_t *words = self->words.buf;
+    uint8_t *memory = self->memory.buf;
+    int cycle = data[CYCLE_AT] | data[CYCLE_AT + 1] << 8;
+    const Part *end = end_of_parts(plan);
+    int usual = plan->words_needed <= self->words.len / WORD
+                && plan->memory_needed <= self->memory.len;
+    for (const Part *part = first_part(plan); usual && part < end; part = next_part(part))
+        usual = is_usual(part, words, cycle, at_ns);
+    if (!usual) {
+        Py_DECREF(plan);
+        return LEFT_TO_PYTHON;
+    }
+    /* A frame taken outside the station's own cycle marks the region as changing itself. */
+    int outside = !(load(&words[STATION_SEQUENCE]) & 1);
+    if (outside) {
+        add(&words[STATION_SEQUENCE], 1);
+        __atomic_thread_fence(__ATOMIC_RELEASE);
+    }
+    int64_t own_cycle = load(&words[STATION_CYCLE]) + outside;
+    for (const Part *part = first_part(plan); part < end; part = next_part(part)) {
+        arrived(part, words, cycle, at_ns, own_cycle);
+        for (int64_t n = 0; n < part->copies; n++)
+            memcpy(memory + part->copy[n].target, data + part->copy[n].source,
+                   (size_t)part->copy[n].size);
+    }
+    for (Py_ssize_t n = 0; n < plan->counter_size / WORD; n++)
+        add(&words[plan->counters[n]], 1);
+    if (outside) {
+        __atomic_thread_fence(__ATOMIC_RELEASE);
+        add(&words[STATION_SEQUENCE], 1);
+    }
+    Py_DECREF(plan);
+    return TAKEN;
+}
+
+static PyObject *handler_call(PortHandler *self, PyObject *args, PyObject *keywords)
+{
+    PyObject *data, *origin, *number;
+    long long at_ns;
+    Py_ssize_t size;
+    Py_buffer view;
+    Result result = LEFT_TO_PYTHON;
+    if (keywords != NULL && PyDict_Size(keywords))
+        return PyErr_Format(PyExc_TypeError, "a handler takes no keywords");
+    if (!PyArg_ParseTuple(args, "OnOO", &data, &size, &number, &origin))
+        return NULL;
+    at_ns = PyLong_AsLongLong(number);
+    if (at_ns == -1 && PyErr_Occurred())
+        return NULL;
+    if (self->fallback == NULL)
+        Py_RETURN_NONE;  /* the port was released */
+    if (PyObject_GetBuffer(data, &view, PyBUF_SIMPLE))
+        return NULL;
+    if (size <= view.len) {
+        PyObject *source = PyObject_CallMethodObjArgs(origin, text_source_of, data, NULL);
+        if (source == NULL)
+            result = FAILED;
+        else if (PyBytes_Check(source))
+            result = take(self, view.buf, size, at_ns, (uint8_t *)PyBytes_AsString(source),
+                          PyBytes_Size(source));
+        Py_XDECREF(source);
+    }
+    PyBuffer_Release(&view);
+    if (result == FAILED)
+        return NULL;
+    if (result == TAKEN)
+        Py_RETURN_NONE;
+    PyObject *fallback = self->fallback;
+    if (fallback == NULL)
+        Py_RETURN_NONE;
+    Py_INCREF(fallback);
+    PyObject *done = PyObject_Call(fallback, args, NULL);
+    Py_DECREF(fallback);
+    return done;
+}
+
+/* ---- Receiver: one batch of recvmmsg for the handlers of a socket ---- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *views;
+    Py_buffer headers, octets, control, senders;
+    Py_ssize_t count, buffer_size, headroom, control_size;
+    int64_t offset_ns;
+    int busy;
+} Receiver;
+
+static void receiver_dealloc(Receiver *self)
+{
+    Py_XDECREF(self->views);
+    release_buffer(&self->headers);
+    release_buffer(&self->octets);
+    release_buffer(&self->control);
+    release_buffer(&self->senders);
+    free_object((PyObject *)self);
+}
+
+static int64_t clock_ns(clockid_t clock)
+{
+    struct timespec now;
+    clock_gettime(clock, &now);
+    return (int64_t)now.tv_sec * BILLION + now.tv_nsec;
+}
+
+static int64_t measure_offset(int64_t *now_ns)
+{
+    *now_ns = clock_ns(CLOCK_MONOTONIC);
+    return *now_ns - clock_ns(CLOCK_REALTIME);
+}
+
+/* As ReceiveBatch._read_clocks(). */
+static int64_t read_clocks(Receiver *self)
+{
+    int64_t now_ns, later_ns, offset_ns = measure_offset(&now_ns);
+    if (offset_ns < self->offset_ns - CLOCK_NOISE_NS) {
+        for (int again = 0; again < 3; again++) {
+            int64_t other_ns = measure_offset(&later_ns);
+            if (other_ns > offset_ns)
+                offset_ns = other_ns;
+        }
+        self->offset_ns = offset_ns;
+    } else if (offset_ns > self->offset_ns)
+        self->offset_ns = offset_ns;
+    return now_ns;
+}
+
+static int receiver_check(Receiver *self, PyObject *senders)
+{
+    struct mmsghdr *headers = self->headers.buf;
+    Py_ssize_t count = self->headers.len / (Py_ssize_t)sizeof(struct mmsghdr);
+    if (count < 1 || self->headers.len % (Py_ssize_t)sizeof(struct mmsghdr)
+        || (uintptr_t)headers % sizeof(void *) || self->octets.len % count
+        || self->control.len != count * self->control_size || self->control_size % 8
+        || self->control_size < (Py_ssize_t)(sizeof(struct cmsghdr) + sizeof(struct timespec)))
+        return refuse("a batch has memory for each of its messages");
+    self->count = count;
+    self->buffer_size = self->octets.len / count;
+    if (self->headroom < 0 || self->headroom > self->buffer_size - SHORTEST
+        || PyList_Size(self->views) != count
+        || (senders != Py_None ? self->senders.len != 16 * count : self->headroom < 12))
+        return refuse("a batch has memory for each of its messages");
+    /* The kernel writes through these: into the memory of the batch and nowhere else. */
+    for (Py_ssize_t n = 0; n < count; n++) {
+        struct msghdr *each = &headers[n].msg_hdr;
+        if (each->msg_iovlen != 1 || each->msg_iov->iov_len > (size_t)self->buffer_size
+            || each->msg_iov->iov_base != (char *)self->octets.buf + n * self->buffer_size
+            || each->msg_control != (char *)self->control.buf + n * self->control_size)
+            return refuse("the headers of a batch describe its memory");
+    }
+    return 0;
+}
+
+static PyObject *receiver_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
+{
+    PyObject *headers, *octets, *control, *senders, *views;
+    Py_ssize_t control_size, headroom;
+    if (!PyArg_ParseTuple(args, "OOOOnnO!", &headers, &octets, &control, &senders, &control_size,
+                          &headroom, &PyList_Type, &views))
+        return NULL;
+    Receiver *self = (Receiver *)make_object(type, keywords);
+    if (self == NULL)
+        return NULL;
+    Py_INCREF(views);
+    self->views = views;
+    self->control_size = control_size;
+    self->headroom = headroom;
+    int64_t now_ns;
+    self->offset_ns = measure_offset(&now_ns);
+    if (PyObject_GetBuffer(headers, &self->headers, PyBUF_CONTIG)
+        || PyObject_GetBuffer(octets, &self->octets, PyBUF_CONTIG)
+        || PyObject_GetBuffer(control, &self->control, PyBUF_CONTIG)
+        || (senders != Py_None && PyObject_GetBuffer(senders, &self->senders, PyBUF_CONTIG))
+        || receiver_check(self, senders)) {
+        Py_DECREF(self);
+        return NULL;
+    }
+    return (PyObject *)self;
+}
+
+/* Return when message *n* arrived; one without a stamp shortened its header, which is mended. */
+static int64_t arrival_ns(Receiver *self, Py_ssize_t n, int64_t now_ns)
+{
+    struct msghdr *header = &((struct mmsghdr *)self->headers.buf)[n].msg_hdr;
+    struct timespec stamp;
+    if ((Py_ssize_t)header->msg_controllen != self->control_size) {
+        header->msg_controllen = (size_t)self->control_size;
+        return now_ns;
+    }
+    memcpy(&stamp, (char *)self->control.buf + n * self->control_size + sizeof(struct cmsghdr),
+           sizeof stamp);
+    int64_t at_ns = (int64_t)((uint64_t)stamp.tv_sec * BILLION + (uint64_t)stamp.tv_nsec
+                              + (uint64_t)self->offset_ns);
+    return at_ns > now_ns ? now_ns : at_ns;
+}
+
+/* Hand message *n* to one handler. */
+static int hand_over(Receiver *self, Py_ssize_t n, Py_ssize_t size, int64_t at_ns,
+                     PyObject *handler, PyObject *origin)
+{
+    const uint8_t *whole = (uint8_t *)self->octets.buf + n * self->buffer_size;
+    PyObject *target = handler;
+    if (Py_IS_TYPE(handler, handler_type)) {
+        const uint8_t *source = self->senders.buf == NULL
+                                    ? whole + 6 : (uint8_t *)self->senders.buf + n * 16 + 4;
+        Result result = size > self->buffer_size - self->headroom ? LEFT_TO_PYTHON
+                        : take((PortHandler *)handler, whole + self->headroom, size, at_ns, source,
+                               self->senders.buf == NULL ? 6 : 4);
+        if (result != LEFT_TO_PYTHON)
+            return result == FAILED ? -1 : 0;
+        target = ((PortHandler *)handler)->fallback;
+        if (target == NULL)  /* the port was released */
+            return 0;
+    }
+    Py_INCREF(target);
+    PyObject *done = PyObject_CallFunction(target, "OnLO", PyList_GetItem(self->views, n), size,
+                                           (long long)at_ns, origin);
+    Py_DECREF(target);
+    Py_XDECREF(done);
+    return done == NULL ? -1 : 0;
+}
+
+/* Return the handlers of a frame of Ethernet by *routes*, borrowed; NULL if there are none. */
+static PyObject *handlers_for(Receiver *self, PyObject *routes, Py_ssize_t n)
+{
+    uint64_t head, mask = 0;
+    uint16_t tag;
+    memset(&mask, 0xFF, 6);
+    memcpy(&head, (char *)self->octets.buf + n * self->buffer_size, sizeof head);
+    memcpy(&tag, (char *)self->control.buf + n * self->control_size + 64, sizeof tag);
+    PyObject *vlan = PyLong_FromLong(tag & 0x0FFF);
+    if (vlan == NULL)
+        return NULL;
+    PyObject *found = PyDict_GetItemWithError(routes, vlan);
+    Py_DECREF(vlan);
+    if (found == NULL || !PyDict_Check(found))
+        return NULL;
+    PyObject *address = PyLong_FromUnsignedLongLong(head & mask);
+    if (address == NULL)
+        return NULL;
+    found = PyDict_GetItemWithError(found, address);
+    Py_DECREF(address);
+    return found;
+}
+
+/* Hand a batch over; return how many messages had a handler, -1 for an error. */
+static Py_ssize_t hand_over_batch(Receiver *self, Py_ssize_t count, PyObject *handlers,
+                                  PyObject *unrouted, PyObject *origin)
+{
+    const struct mmsghdr *headers = self->headers.buf;
+    int64_t now_ns = read_clocks(self);
+    Py_ssize_t taken = 0;
+    for (Py_ssize_t n = 0; n < count; n++) {
+        int64_t at_ns = arrival_ns(self, n, now_ns);
+        PyObject *list = handlers;
+        if (unrouted != Py_None && (list = handlers_for(self, handlers, n)) == NULL) {
+            if (PyErr_Occurred())
+                return -1;
+            PyObject *counted = PyObject_CallFunction(unrouted, "n", n);
+            Py_XDECREF(counted);
+            if (counted == NULL)
+                return -1;
+            continue;
+        }
+        if (!PyList_Check(list)) {
+            refuse("handlers are in a list");
+            return -1;
+        }
+        Py_INCREF(list);  /* a handler may exchange it */
+        int failed = 0;
+        taken += PyList_Size(list) > 0;
+        for (Py_ssize_t i = 0; !failed && i < PyList_Size(list); i++) {
+            PyObject *handler = PyList_GetItem(list, i);
+            Py_INCREF(handler);
+            failed = hand_over(self, n, (Py_ssize_t)headers[n].msg_len - self->headroom, at_ns,
+                               handler, origin);
+            Py_DECREF(handler);
+        }
+        Py_DECREF(list);
+        if (failed)
+            return -1;
+    }
+    return taken;
+}
+
+static PyObject *receiver_drain(Receiver *self, PyObject *args)
+{
+    int fd;
+    PyObject *handlers, *unrouted, *origin, *note;
+    Py_ssize_t total = 0;
+    if (!PyArg_ParseTuple(args, "iOOOO", &fd, &handlers, &unrouted, &origin, &note))
+        return NULL;
+    if (unrouted != Py_None ? !PyDict_Check(handlers) || self->control_size < 66
+                            : !PyList_Check(handlers) || self->senders.buf == NULL)
+        return PyErr_Format(PyExc_TypeError, "a list of handlers, or routes of a packet socket");
+    if (self->busy)
+        return PyErr_Format(PyExc_RuntimeError, "the batch is in use");
+    self->busy = 1;
+    for (int batch = 0; batch < MAX_BATCHES; batch++) {
+        int count = recvmmsg(fd, self->headers.buf, (unsigned)self->count, MSG_DONTWAIT, NULL);
+        if (count < 0 && errno == EAGAIN)
+            break;
+        if (count < 0) {
+            PyObject *again = PyObject_CallFunction(note, "i", errno);
+            int goes_on = again == NULL ? -1 : PyObject_IsTrue(again);
+            Py_XDECREF(again);
+            if (goes_on < 0)
+                goto failed;
+            if (!goes_on)
+                break;
+            continue;
+        }
+        Py_ssize_t taken = hand_over_batch(self, count, handlers, unrouted, origin);
+        if (taken < 0)
+            goto failed;
+        total += taken;
+        if (count == 1 || count < self->count)
+            break;
+    }
+    self->busy = 0;
+    return PyLong_FromSsize_t(total);
+failed:
+    self->busy = 0;
+    return NULL;
+}
+
+/* ---- Module ---- */
+
+static PyMethodDef handler_methods[] = {
+    {"attach", (PyCFunction)handler_attach, METH_VARARGS, NULL},
+    {"detach", (PyCFunction)handler_detach, METH_NOARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+static PyMemberDef handler_members[] = {
+    {"open_from_ns", T_LONGLONG, offsetof(PortHandler, open_from_ns), 0, NULL},
+    {"__weaklistoffset__", T_PYSSIZET, offsetof(PortHandler, weak_references), READONLY, NULL},
+    {NULL, 0, 0, 0, NULL},
+};
+static PyMethodDef receiver_methods[] = {
+    {"drain", (PyCFunction)receiver_drain, METH_VARARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+static PyType_Slot plan_slots[] = {
+    {Py_tp_new, plan_new}, {Py_tp_dealloc, plan_dealloc}, {0, NULL},
+};
+static PyType_Slot handler_slots[] = {
+    {Py_tp_new, handler_new}, {Py_tp_dealloc, handler_dealloc}, {Py_tp_call, handler_call},
+    {Py_tp_traverse, handler_traverse}, {Py_tp_clear, handler_clear},
+    {Py_tp_methods, handler_methods}, {Py_tp_members, handler_members}, {0, NULL},
+};
+static PyType_Slot receiver_slots[] = {
+    {Py_tp_new, receiver_new}, {Py_tp_dealloc, receiver_dealloc},
+    {Py_tp_methods, receiver_methods}, {0, NULL},
+};
+static PyType_Spec plan_spec = {
+    "eap._cyclic.Plan", sizeof(Plan), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_IMMUTABLETYPE, plan_slots,
+};
+static PyType_Spec handler_spec = {
+    "eap._cyclic.PortHandler", sizeof(PortHandler), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_IMMUTABLETYPE, handler_slots,
+};
+static PyType_Spec receiver_spec = {
+    "eap._cyclic.Receiver", sizeof(Receiver), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_IMMUTABLETYPE,
+    receiver_slots,
+};
+
+static int add_type(PyObject *module, PyType_Spec *spec, PyTypeObject **type, const char *name)
+{
+    *type = (PyTypeObject *)PyType_FromSpec(spec);
+    return *type == NULL ? -1 : PyModule_AddObjectRef(module, name, (PyObject *)*type);
+}
+
+static struct PyModuleDef definition = {
+    PyModuleDef_HEAD_INIT, "eap._cyclic", "Compiled part of the cyclic path.", -1,
+    NULL, NULL, NULL, NULL, NULL,
+};
+
+PyMODINIT_FUNC PyInit__cyclic(void)
+{
+    const char *pure = getenv("EAP_PURE");
+    if (pure != NULL && *pure && strcmp(pure, "0"))
+        return PyErr_Format(PyExc_ImportError, "EAP_PURE is set");
+    PyObject *module = PyModule_Create(&definition);
+    PyObject *offsets = Py_BuildValue(
+        "(iiiiiiiiiiiiiii)", STATION_CYCLE, STATION_SEQUENCE, RECEIVED, DUPLICATED, LATE, STATE,
+        LAST_CYCLE, ARRIVED_AT_NS, ARRIVED_IN_CYCLE, BEHIND, JITTER_MAX_US, JITTER, TRACKER_WORDS,
+        CYCLE_AT, FIRST_PD);
+    if (module == NULL || offsets == NULL
+        || (text_fast = PyUnicode_InternFromString("fast")) == NULL
+        || (text_source = PyUnicode_InternFromString("source")) == NULL
+        || (text_source_of = PyUnicode_InternFromString("source_of")) == NULL
+        || (text_wanted = PyUnicode_InternFromString("wanted")) == NULL
+        || add_type(module, &plan_spec, &plan_type, "Plan")
+        || add_type(module, &handler_spec, &handler_type, "PortHandler")
+        || add_type(module, &receiver_spec, &receiver_type, "Receiver")
+        || PyModule_AddObjectRef(module, "OFFSETS", offsets)
+        || PyModule_AddIntConstant(module, "API", API)) {
+        Py_XDECREF(offsets);
+        Py_XDECREF(module);
+        return NULL;
+    }
+    Py_DECREF(offsets);
+    return module;
+}

@@ -1,0 +1,27 @@
+"""The compiled part of the cyclic path, ``eap/_cyclic.c``, where it was built.
+
+Python code does the same, slower: it is the reference, and what the compiled part leaves to it.
+``EAP_PURE=1`` in the environment of a process has it use Python alone.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+_API = 1
+"""Of the source; a file that was built from an older one is not used."""
+
+
+def _find() -> ModuleType | None:
+    try:
+        from eap import _cyclic
+    except ImportError:  # not built, or refused because of EAP_PURE
+        return None
+    return _cyclic if _cyclic.API == _API else None
+
+
+cyclic = _find()
+"""The module, None without it."""
