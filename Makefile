@@ -15,7 +15,7 @@ COMPILED := eap/_cyclic.c tools/package/compiled.py
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo valve test test-tools test-package fuzz properties check structure bench dist deb clean
+.PHONY: help setup demo valve test test-pure test-tools test-package fuzz properties check structure bench dist deb clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -45,6 +45,9 @@ PYTEST := sh tools/isolated.sh $(BIN)/python -m pytest -n auto --dist loadfile -
 test: setup  ## run all tests of the product; as root, first install the programs they use
 	@sh tools/install_peers.sh test || echo 'make test: going on; what needs them is skipped and listed'
 	@$(PYTEST) --ignore=tests/tools --ignore=tests/package $(ARGS)
+
+test-pure: setup  ## run the tests of the cyclic path without its compiled part
+	@EAP_PURE=1 $(PYTEST) tests/unit/eap/pd tests/unit/eap/net $(ARGS)
 
 test-tools: setup  ## run the tests of tools/: fuzz targets, page of faults, benchmarks
 	@$(PYTEST) tests/tools $(ARGS)

@@ -47,13 +47,11 @@ static int64_t load(const int64_t *word) { return __atomic_load_n(word, __ATOMIC
 
 static void store(int64_t *word, int64_t value) { __atomic_store_n(word, value, __ATOMIC_RELAXED); }
 
-static void add(int64_t *word, int64_t more)
-{
+static void add(int64_t *word, int64_t more) {
     store(word, (int64_t)((uint64_t)load(word) + (uint64_t)more));
 }
 
-static void release_buffer(Py_buffer *buffer)
-{
+static void release_buffer(Py_buffer *buffer) {
     PyBuffer_Release(buffer);
     memset(buffer, 0, sizeof *buffer);  /* nothing may be read there any more */
 }
@@ -84,28 +82,24 @@ typedef struct {
 static PyTypeObject *plan_type, *handler_type, *receiver_type;
 
 /* Free the memory of an object of ours; its parts are gone. */
-static void free_object(PyObject *self)
-{
+static void free_object(PyObject *self) {
     PyTypeObject *type = Py_TYPE(self);
     ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
     Py_DECREF(type);
 }
 
-static PyObject *make_object(PyTypeObject *type, PyObject *keywords)
-{
+static PyObject *make_object(PyTypeObject *type, PyObject *keywords) {
     if (keywords != NULL && PyDict_Size(keywords))
         return PyErr_Format(PyExc_TypeError, "there are no keywords");
     return ((allocfunc)PyType_GetSlot(type, Py_tp_alloc))(type, 0);
 }
 
-static int refuse(const char *what)
-{
+static int refuse(const char *what) {
     PyErr_SetString(PyExc_ValueError, what);
     return -1;
 }
 
-static void plan_dealloc(Plan *self)
-{
+static void plan_dealloc(Plan *self) {
     Py_XDECREF(self->watch);
     PyMem_Free(self->headers);
     PyMem_Free(self->parts);
@@ -114,8 +108,7 @@ static void plan_dealloc(Plan *self)
 }
 
 /* Return a copy of *octets* that is aligned for words. */
-static void *copy_of(const char *octets, Py_ssize_t size)
-{
+static void *copy_of(const char *octets, Py_ssize_t size) {
     void *copy = PyMem_Malloc((size_t)size + 1);
     if (copy == NULL)
         PyErr_NoMemory();
@@ -124,13 +117,11 @@ static void *copy_of(const char *octets, Py_ssize_t size)
     return copy;
 }
 
-static Py_ssize_t pd_size(const uint8_t *header)
-{
+static Py_ssize_t pd_size(const uint8_t *header) {
     return PD_HEADER + (header[PD_LENGTH] | header[PD_LENGTH + 1] << 8);
 }
 
-static int need(int64_t *needed, int64_t first, int64_t count)
-{
+static int need(int64_t *needed, int64_t first, int64_t count) {
     if (first < 0 || count < 0 || first > MAX_INDEX || count > MAX_INDEX)
         return refuse("a plan reaches outside of the image");
     if (first + count > *needed)
@@ -141,8 +132,7 @@ static int need(int64_t *needed, int64_t first, int64_t count)
 static int is_time(int64_t ns) { return ns >= 0 && ns <= MAX_NS; }
 
 /* Check all that the plan says before it is used for a frame. */
-static int plan_check(Plan *self)
-{
+static int plan_check(Plan *self) {
     Py_ssize_t at = FIRST_PD, rest = self->part_size;
     for (Py_ssize_t n = 0; n < self->header_size; n += PD_COMPARED)
         at += pd_size(self->headers + n);
@@ -176,8 +166,10 @@ static int plan_check(Plan *self)
     return 0;
 }
 
-static PyObject *plan_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
-{
+/* Plan(end, headers, parts, counters, watch): bytes of the frame; of each PD the header without its
+   quality; trackers with their copies; indexes of words to add one to; an object whose `source` is
+   the address that the frames come from.  */
+static PyObject *plan_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
     const char *headers, *parts, *counters;
     PyObject *watch;
     Plan *self = (Plan *)make_object(type, keywords);
@@ -202,20 +194,17 @@ failed:
     return NULL;
 }
 
-static const Part *next_part(const Part *part)
-{
+static const Part *next_part(const Part *part) {
     return (const Part *)(part->copy + part->copies);
 }
 
 static const Part *first_part(const Plan *plan) { return (const Part *)plan->parts; }
 
-static const Part *end_of_parts(const Plan *plan)
-{
+static const Part *end_of_parts(const Plan *plan) {
     return (const Part *)(plan->parts + plan->part_size);
 }
 
-static int plan_matches(const Plan *self, const uint8_t *data, Py_ssize_t size)
-{
+static int plan_matches(const Plan *self, const uint8_t *data, Py_ssize_t size) {
     Py_ssize_t at = FIRST_PD;
     if (self->end > size)
         return 0;
@@ -230,8 +219,7 @@ static int plan_matches(const Plan *self, const uint8_t *data, Py_ssize_t size)
 /* ---- SequenceTracker, the usual cases of arrived() ---- */
 
 /* Whether *part* takes a frame as arrived() does without a loss, a reorder or a wrap. */
-static int is_usual(const Part *part, const int64_t *words, int cycle, int64_t at_ns)
-{
+static int is_usual(const Part *part, const int64_t *words, int cycle, int64_t at_ns) {
     int64_t last = load(&words[part->first + LAST_CYCLE]);
     int64_t before_ns = load(&words[part->first + ARRIVED_AT_NS]);
     if (last < 0)
@@ -244,8 +232,7 @@ static int is_usual(const Part *part, const int64_t *words, int cycle, int64_t a
     return gap == part->usual_gap || (gap <= NEAR && !(part->step && gap >= 2 * part->step));
 }
 
-static int bin_of(int64_t micros)
-{
+static int bin_of(int64_t micros) {
     if (micros < 4)
         return (int)micros;
     int exponent = 64 - __builtin_clzll((unsigned long long)micros);
@@ -254,8 +241,7 @@ static int bin_of(int64_t micros)
     return 4 * (exponent - 2) + (int)(micros >> (exponent - 3) & 3);
 }
 
-static void enter_jitter(const Part *part, int64_t *tracker, int64_t deviation_ns)
-{
+static void enter_jitter(const Part *part, int64_t *tracker, int64_t deviation_ns) {
     if (deviation_ns > part->own_cycle_ns)
         add(&tracker[LATE], 1);
     int64_t micros = (deviation_ns < 0 ? -deviation_ns : deviation_ns) / 1000;
@@ -264,8 +250,7 @@ static void enter_jitter(const Part *part, int64_t *tracker, int64_t deviation_n
         store(&tracker[JITTER_MAX_US], micros);
 }
 
-static void arrived(const Part *part, int64_t *words, int cycle, int64_t at_ns, int64_t own_cycle)
-{
+static void arrived(const Part *part, int64_t *words, int cycle, int64_t at_ns, int64_t own_cycle) {
     int64_t *tracker = words + part->first;
     int64_t last = load(&tracker[LAST_CYCLE]), position = cycle;
     if (last >= 0) {
@@ -295,8 +280,7 @@ typedef struct {
     long long open_from_ns;
 } PortHandler;
 
-static int handler_clear(PortHandler *self)
-{
+static int handler_clear(PortHandler *self) {
     Py_CLEAR(self->plans);
     release_buffer(&self->memory);
     release_buffer(&self->words);
@@ -305,8 +289,7 @@ static int handler_clear(PortHandler *self)
     return 0;
 }
 
-static int handler_traverse(PortHandler *self, visitproc visit, void *arg)
-{
+static int handler_traverse(PortHandler *self, visitproc visit, void *arg) {
     Py_VISIT(Py_TYPE((PyObject *)self));
     Py_VISIT(self->fallback);
     Py_VISIT(self->learner);
@@ -315,8 +298,7 @@ static int handler_traverse(PortHandler *self, visitproc visit, void *arg)
     return 0;
 }
 
-static void handler_dealloc(PortHandler *self)
-{
+static void handler_dealloc(PortHandler *self) {
     PyObject_GC_UnTrack(self);
     if (self->weak_references != NULL)
         PyObject_ClearWeakRefs((PyObject *)self);
@@ -324,8 +306,9 @@ static void handler_dealloc(PortHandler *self)
     free_object((PyObject *)self);
 }
 
-static PyObject *handler_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
-{
+/* PortHandler(fallback, learner): *fallback* takes what is left to Python, which is everything as long
+   as the `wanted` of *learner*, or None, is not empty.  Frames from before open_from_ns are, too.  */
+static PyObject *handler_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
     PyObject *fallback, *learner;
     if (!PyArg_ParseTuple(args, "OO", &fallback, &learner))
         return NULL;
@@ -340,8 +323,8 @@ static PyObject *handler_new(PyTypeObject *type, PyObject *args, PyObject *keywo
     return (PyObject *)self;
 }
 
-static PyObject *handler_attach(PortHandler *self, PyObject *args)
-{
+/* attach(plans, memory, words): look for plans there, and write there, from now on. */
+static PyObject *handler_attach(PortHandler *self, PyObject *args) {
     PyObject *plans, *memory, *words;
     Py_buffer new_memory = {0}, new_words = {0};
     if (!PyArg_ParseTuple(args, "O!OO", &PyDict_Type, &plans, &memory, &words))
@@ -368,16 +351,15 @@ failed:
     return NULL;
 }
 
-static PyObject *handler_detach(PortHandler *self, PyObject *nothing)
-{
+/* detach(): let go of everything; frames are ignored from now on. */
+static PyObject *handler_detach(PortHandler *self, PyObject *nothing) {
     (void)nothing;
     handler_clear(self);
     Py_RETURN_NONE;
 }
 
 /* Return whether the learner of addresses wants to see frames; -1 for an error. */
-static int is_learning(PortHandler *self)
-{
+static int is_learning(PortHandler *self) {
     if (self->learner == NULL || self->learner == Py_None)
         return 0;
     PyObject *wanted = PyObject_GetAttr(self->learner, text_wanted);
@@ -387,8 +369,7 @@ static int is_learning(PortHandler *self)
 }
 
 /* Return the plans of the frames with the key of *data*; NULL if there are none. */
-static PyObject *plans_of(PortHandler *self, const uint8_t *data)
-{
+static PyObject *plans_of(PortHandler *self, const uint8_t *data) {
     PyObject *key = Py_BuildValue("(y#y#)", (const char *)data, (Py_ssize_t)KEY_HEAD,
                                   (const char *)data + SM_AT, (Py_ssize_t)KEY_TAIL);
     PyObject *plans = key == NULL ? NULL : PyDict_GetItemWithError(self->plans, key);
@@ -398,8 +379,7 @@ static PyObject *plans_of(PortHandler *self, const uint8_t *data)
 }
 
 /* Return whether the frames of *plan* come from *source* as before; -1 for an error. */
-static int comes_from(const Plan *plan, const uint8_t *source, Py_ssize_t size)
-{
+static int comes_from(const Plan *plan, const uint8_t *source, Py_ssize_t size) {
     PyObject *known = PyObject_GetAttr(plan->watch, text_source);
     if (known == NULL)
         return -1;
@@ -411,8 +391,7 @@ static int comes_from(const Plan *plan, const uint8_t *source, Py_ssize_t size)
 
 /* Return the plan of a frame; NULL if Python has to look, or for an error. */
 static Plan *find_plan(PortHandler *self, const uint8_t *data, Py_ssize_t size,
-                       const uint8_t *source, Py_ssize_t source_size)
-{
+                       const uint8_t *source, Py_ssize_t source_size) {
     PyObject *plans = plans_of(self, data), *found = NULL;
     Py_ssize_t count = plans != NULL && PyList_Check(plans) ? PyList_Size(plans) : 0;
     for (Py_ssize_t n = 0; found == NULL && n < count; n++) {
@@ -436,8 +415,7 @@ static Plan *find_plan(PortHandler *self, const uint8_t *data, Py_ssize_t size,
 
 /* Take a frame, of which all *size* bytes are there, if it is a usual one. */
 static Result take(PortHandler *self, const uint8_t *data, Py_ssize_t size, int64_t at_ns,
-                   const uint8_t *source, Py_ssize_t source_size)
-{
+                   const uint8_t *source, Py_ssize_t source_size) {
     if (self->plans == NULL || size < SHORTEST || at_ns < self->open_from_ns || !is_time(at_ns))
         return LEFT_TO_PYTHON;
     int learning = is_learning(self);
@@ -468,8 +446,8 @@ static Result take(PortHandler *self, const uint8_t *data, Py_ssize_t size, int6
     for (const Part *part = first_part(plan); part < end; part = next_part(part)) {
         arrived(part, words, cycle, at_ns, own_cycle);
         for (int64_t n = 0; n < part->copies; n++)
-            memcpy(memory + part->copy[n].target, data + part->copy[n].source,
-                   (size_t)part->copy[n].size);
+            memmove(memory + part->copy[n].target, data + part->copy[n].source,
+                    (size_t)part->copy[n].size);
     }
     for (Py_ssize_t n = 0; n < plan->counter_size / WORD; n++)
         add(&words[plan->counters[n]], 1);
@@ -481,8 +459,8 @@ static Result take(PortHandler *self, const uint8_t *data, Py_ssize_t size, int6
     return TAKEN;
 }
 
-static PyObject *handler_call(PortHandler *self, PyObject *args, PyObject *keywords)
-{
+/* handler(data, size, at_ns, origin): take a frame as receive_frame() does. */
+static PyObject *handler_call(PortHandler *self, PyObject *args, PyObject *keywords) {
     PyObject *data, *origin, *number;
     long long at_ns;
     Py_ssize_t size;
@@ -533,8 +511,7 @@ typedef struct {
     int busy;
 } Receiver;
 
-static void receiver_dealloc(Receiver *self)
-{
+static void receiver_dealloc(Receiver *self) {
     Py_XDECREF(self->views);
     release_buffer(&self->headers);
     release_buffer(&self->octets);
@@ -543,22 +520,19 @@ static void receiver_dealloc(Receiver *self)
     free_object((PyObject *)self);
 }
 
-static int64_t clock_ns(clockid_t clock)
-{
+static int64_t clock_ns(clockid_t clock) {
     struct timespec now;
     clock_gettime(clock, &now);
     return (int64_t)now.tv_sec * BILLION + now.tv_nsec;
 }
 
-static int64_t measure_offset(int64_t *now_ns)
-{
+static int64_t measure_offset(int64_t *now_ns) {
     *now_ns = clock_ns(CLOCK_MONOTONIC);
     return *now_ns - clock_ns(CLOCK_REALTIME);
 }
 
 /* As ReceiveBatch._read_clocks(). */
-static int64_t read_clocks(Receiver *self)
-{
+static int64_t read_clocks(Receiver *self) {
     int64_t now_ns, later_ns, offset_ns = measure_offset(&now_ns);
     if (offset_ns < self->offset_ns - CLOCK_NOISE_NS) {
         for (int again = 0; again < 3; again++) {
@@ -572,8 +546,7 @@ static int64_t read_clocks(Receiver *self)
     return now_ns;
 }
 
-static int receiver_check(Receiver *self, PyObject *senders)
-{
+static int receiver_check(Receiver *self, PyObject *senders) {
     struct mmsghdr *headers = self->headers.buf;
     Py_ssize_t count = self->headers.len / (Py_ssize_t)sizeof(struct mmsghdr);
     if (count < 1 || self->headers.len % (Py_ssize_t)sizeof(struct mmsghdr)
@@ -598,8 +571,8 @@ static int receiver_check(Receiver *self, PyObject *senders)
     return 0;
 }
 
-static PyObject *receiver_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
-{
+/* Receiver(headers, octets, control, senders, control_size, headroom, views): of a ReceiveBatch. */
+static PyObject *receiver_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
     PyObject *headers, *octets, *control, *senders, *views;
     Py_ssize_t control_size, headroom;
     if (!PyArg_ParseTuple(args, "OOOOnnO!", &headers, &octets, &control, &senders, &control_size,
@@ -626,8 +599,7 @@ static PyObject *receiver_new(PyTypeObject *type, PyObject *args, PyObject *keyw
 }
 
 /* Return when message *n* arrived; one without a stamp shortened its header, which is mended. */
-static int64_t arrival_ns(Receiver *self, Py_ssize_t n, int64_t now_ns)
-{
+static int64_t arrival_ns(Receiver *self, Py_ssize_t n, int64_t now_ns) {
     struct msghdr *header = &((struct mmsghdr *)self->headers.buf)[n].msg_hdr;
     struct timespec stamp;
     if ((Py_ssize_t)header->msg_controllen != self->control_size) {
@@ -643,8 +615,7 @@ static int64_t arrival_ns(Receiver *self, Py_ssize_t n, int64_t now_ns)
 
 /* Hand message *n* to one handler. */
 static int hand_over(Receiver *self, Py_ssize_t n, Py_ssize_t size, int64_t at_ns,
-                     PyObject *handler, PyObject *origin)
-{
+                     PyObject *handler, PyObject *origin) {
     const uint8_t *whole = (uint8_t *)self->octets.buf + n * self->buffer_size;
     PyObject *target = handler;
     if (Py_IS_TYPE(handler, handler_type)) {
@@ -668,8 +639,7 @@ static int hand_over(Receiver *self, Py_ssize_t n, Py_ssize_t size, int64_t at_n
 }
 
 /* Return the handlers of a frame of Ethernet by *routes*, borrowed; NULL if there are none. */
-static PyObject *handlers_for(Receiver *self, PyObject *routes, Py_ssize_t n)
-{
+static PyObject *handlers_for(Receiver *self, PyObject *routes, Py_ssize_t n) {
     uint64_t head, mask = 0;
     uint16_t tag;
     memset(&mask, 0xFF, 6);
@@ -692,8 +662,7 @@ static PyObject *handlers_for(Receiver *self, PyObject *routes, Py_ssize_t n)
 
 /* Hand a batch over; return how many messages had a handler, -1 for an error. */
 static Py_ssize_t hand_over_batch(Receiver *self, Py_ssize_t count, PyObject *handlers,
-                                  PyObject *unrouted, PyObject *origin)
-{
+                                  PyObject *unrouted, PyObject *origin) {
     const struct mmsghdr *headers = self->headers.buf;
     int64_t now_ns = read_clocks(self);
     Py_ssize_t taken = 0;
@@ -730,8 +699,11 @@ static Py_ssize_t hand_over_batch(Receiver *self, Py_ssize_t count, PyObject *ha
     return taken;
 }
 
-static PyObject *receiver_drain(Receiver *self, PyObject *args)
-{
+/* drain(fd, handlers, unrouted, origin, note_error): hand all waiting messages over, at most four
+   batches; return how many had a handler.  With *unrouted*, *handlers* has those of each VLAN and
+   address, and *unrouted* gets the position of each other message.  *note_error* gets an errno, and
+   returns whether messages may still wait.  */
+static PyObject *receiver_drain(Receiver *self, PyObject *args) {
     int fd;
     PyObject *handlers, *unrouted, *origin, *note;
     Py_ssize_t total = 0;
@@ -811,8 +783,7 @@ static PyType_Spec receiver_spec = {
     receiver_slots,
 };
 
-static int add_type(PyObject *module, PyType_Spec *spec, PyTypeObject **type, const char *name)
-{
+static int add_type(PyObject *module, PyType_Spec *spec, PyTypeObject **type, const char *name) {
     *type = (PyTypeObject *)PyType_FromSpec(spec);
     return *type == NULL ? -1 : PyModule_AddObjectRef(module, name, (PyObject *)*type);
 }
@@ -822,8 +793,7 @@ static struct PyModuleDef definition = {
     NULL, NULL, NULL, NULL, NULL,
 };
 
-PyMODINIT_FUNC PyInit__cyclic(void)
-{
+PyMODINIT_FUNC PyInit__cyclic(void) {
     const char *pure = getenv("EAP_PURE");
     if (pure != NULL && *pure && strcmp(pure, "0"))
         return PyErr_Format(PyExc_ImportError, "EAP_PURE is set");

@@ -6,10 +6,8 @@ Python code does the same, slower: it is the reference, and what the compiled pa
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from types import ModuleType
+from importlib import import_module
+from types import ModuleType
 
 _API = 1
 """Of the source; a file that was built from an older one is not used."""
@@ -17,10 +15,10 @@ _API = 1
 
 def _find() -> ModuleType | None:
     try:
-        from eap import _cyclic
+        found = import_module("eap._cyclic")
     except ImportError:  # not built, or refused because of EAP_PURE
         return None
-    return _cyclic if _cyclic.API == _API else None
+    return found if found.API == _API else None
 
 
 cyclic = _find()

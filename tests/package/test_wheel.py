@@ -65,10 +65,11 @@ def use(folder: Path, eapctl: Path) -> None:
             plant.terminate()
 
 
-def environment_in(folder: Path, what: str) -> Path:
+def environment_in(folder: Path, what: str, *, compiler: str = "cc") -> Path:
     """Return eapctl of a clean environment with *what*."""
     run(folder, sys.executable, "-m", "venv", folder / "venv")
-    run(folder, folder / "venv/bin/pip", "install", "--quiet", what)
+    install = ("env", f"CC={compiler}", folder / "venv/bin/pip", "install", "--quiet")
+    run(folder, *install, what)
     return folder / "venv/bin/eapctl"
 
 
@@ -90,7 +91,8 @@ def test_wheel_in_a_clean_environment_runs_a_plant(tmp_path):
     wheel = built("*.whl")
     eapctl = environment_in(tmp_path, str(wheel))
     (product,) = distributions(path=[str(wheel)])
-    assert run(tmp_path, eapctl, "--version") == f"eapctl {product.version}\n"
+    is_compiled = "-abi3-" in wheel.name
+    assert run(tmp_path, eapctl, "--version") == says(product.version, is_compiled=is_compiled)
     use(tmp_path, eapctl)
     # What is not installed is named with its extra.
     assert "eap-appliance[web]" in run(tmp_path, eapctl, "web", "line.yaml", code=2)
@@ -110,11 +112,24 @@ def test_all_extras_are_in_all():
 
 
 def test_archive_of_sources_installs_the_same_version(tmp_path):
-    (product,) = distributions(path=[str(built("*.whl"))])
+    wheel = built("*.whl")
+    (product,) = distributions(path=[str(wheel)])
     eapctl = environment_in(tmp_path, str(built("*.tar.gz")))
-    assert run(tmp_path, eapctl, "--version") == f"eapctl {product.version}\n"
+    is_compiled = "-abi3-" in wheel.name
+    assert run(tmp_path, eapctl, "--version") == says(product.version, is_compiled=is_compiled)
     run(tmp_path, eapctl, "new", "x.yaml", "--from", "valve")
     assert "no errors" in run(tmp_path, eapctl, "check", "x.yaml")
+
+
+def test_archive_of_sources_runs_a_plant_where_no_compiler_is(tmp_path):
+    (product,) = distributions(path=[str(built("*.whl"))])
+    eapctl = environment_in(tmp_path, str(built("*.tar.gz")), compiler="no-compiler-here")
+    assert run(tmp_path, eapctl, "--version") == says(product.version, is_compiled=False)
+    use(tmp_path, eapctl)
+
+
+def says(version: str, *, is_compiled: bool) -> str:
+    return f"eapctl {version} (cyclic path {'compiled' if is_compiled else 'in Python'})\n"
 
 
 def test_pipx_installs_the_wheel_with_extras(tmp_path):

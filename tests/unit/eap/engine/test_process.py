@@ -15,6 +15,7 @@ from time import monotonic_ns
 import msgspec
 import pytest
 
+from eap.compiled import cyclic
 from eap.engine import process as engine_process
 from eap.engine import process as module
 from eap.engine.build import EnginePlant
@@ -111,7 +112,10 @@ def test_engine_reports_start_and_ends_on_sigterm(tmp_path, number):
         assert [each.step for each in steps][-2:] == [
             "starting the stations", "running the first cycle"
         ]  # fmt: skip
-        assert ready.ready == {"realtime": {"scheduler": "other: not requested"}}
+        assert ready.ready == {
+            "realtime": {"scheduler": "other: not requested"},
+            "compiled": cyclic is not None,
+        }
         assert min(cycles(tmp_path)) >= 1
         engine.process.send_signal(number)
         assert engine.process.communicate(timeout=20)[1] == ""
