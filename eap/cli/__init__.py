@@ -3,8 +3,9 @@
 A module has the commands of one area and is imported when one of them is used: ``plant`` (check,
 new, run), ``change`` (plan, apply, rollback), ``status``, ``pd``, ``od`` (also state), ``network``
 (scan and trace), ``routes``, ``bus``, ``gateway`` (also gw), ``sim``, ``decode``, ``discover``,
-``types``, ``log``, ``files`` (import and export-peer), ``inventory``, ``keys``, ``top``
-(``top_model`` has its rows).
+``types``, ``log``, ``files`` (import and export-peer), ``inventory``, ``addresses``, ``keys``,
+``web``, ``completion``, ``record`` (``recorders`` runs them, ``recordings`` reads their files),
+``plot``, ``replay``, ``top`` (``top_model`` has its rows).
 A command reads a plant file, starts an appliance in the foreground, or calls an operation of
 ``eap.ops`` or ``eap.live``, which returns a typed result.  ``output`` prints that as JSON or by the
 command's view (``*_view``, ``od_text``).  ``params`` has what commands share, ``group`` the main
