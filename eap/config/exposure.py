@@ -18,6 +18,7 @@ from eap.config.brokers import brokers_of, parse_url
 from eap.config.field_sections import FieldServerSection, ModbusSection, S7Section
 from eap.config.finding import FindingReport
 from eap.config.index import Index
+from eap.config.mqtt_sections import MqttSection
 from eap.config.opcua_sections import ChannelSecurity, ClientTrust
 from eap.config.structs import (
     ANY_SOURCE,
@@ -219,25 +220,26 @@ def _interfaces(index: Index) -> Iterator[Found]:
 def _brokers(index: Index) -> Iterator[Found]:
     for station in index.plant.stations:
         for route in brokers_of(station):
-            yield from _broker(f"{station.name}'s broker {route.mqtt}", f"{route.at}.mqtt", route)
+            what = f"{station.name}'s broker {route.mqtt}"
+            yield from _broker(what, f"{route.at}.mqtt", route, route.mqtt)
     mqtt = index.plant.mqtt
     if mqtt is not None and "://" in mqtt.broker:
-        at = f"{mqtt.at}.broker"
-        yield from _broker(f"the broker of values {mqtt.broker}", at, mqtt, url=mqtt.broker)
+        what = f"the broker of values {mqtt.broker}"
+        yield from _broker(what, f"{mqtt.at}.broker", mqtt, mqtt.broker)
 
 
-def _broker(what: str, at: str, client: RouteSection | object, url: str = "") -> Iterator[Found]:
-    url = url or getattr(client, "mqtt", "")
-    tls = getattr(client, "tls", None)
-    if not getattr(client, "user", "") and (tls is None or not tls.certificate):
+def _broker(what: str, at: str, client: RouteSection | MqttSection, url: str) -> Iterator[Found]:
+    tls = client.tls
+    if not client.user and (tls is None or not tls.certificate):
         yield at, "CR 1.2", f"{what} requires no login", "user and password_file, or a certificate"
-    if tls is None and not parse_url(url).needs_tls and not _is_loopback(parse_url(url).host):
+    broker = parse_url(url)
+    if tls is None and not broker.needs_tls and not _is_loopback(broker.host):
         yield at, "CR 4.1", f"{what} is reached without encryption", "tls: {ca: ...}"
 
 
 def _servers(index: Index) -> Iterator[Found]:
     opcua = index.plant.opcua
-    if opcua is not None and not _is_loopback(parse_listen(opcua.listen).host):
+    if opcua is not None and not parse_listen(opcua.listen).is_loopback:
         if ChannelSecurity.NONE in opcua.security:
             yield (
                 f"{opcua.at}.security",
@@ -260,7 +262,7 @@ def _servers(index: Index) -> Iterator[Found]:
                 "clients: trusted",
             )
     for section in (index.plant.web, index.plant.metrics):
-        if section is None or _is_loopback(parse_listen(section.listen).host):
+        if section is None or parse_listen(section.listen).is_loopback:
             continue
         if section.anonymous is not None:
             yield (
@@ -276,8 +278,7 @@ def _field_servers(index: Index) -> Iterator[Found]:
     sections: tuple[S7Section | ModbusSection | None, ...] = (index.plant.s7, index.plant.modbus)
     for section, name in zip(sections, ("S7", "Modbus"), strict=True):
         server: FieldServerSection | None = None if section is None else section.server
-        listen = getattr(server, "listen", "")
-        if server is not None and not _is_loopback(parse_listen(listen).host):
+        if server is not None and not parse_listen(server.listen).is_loopback:
             yield (
                 server.at,
                 "CR 1.1",

@@ -73,6 +73,7 @@ class ServedSection(Section, frozen=True, kw_only=True):
 class FieldServerSection(Section, frozen=True, kw_only=True):
     """Server of variables of this plant."""
 
+    listen: str
     every_ms: FieldPeriod = 100
 
 
