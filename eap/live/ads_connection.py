@@ -126,6 +126,7 @@ class AdsConnection:
         self._writer = writer
         self._target = target
         self._source = source
+        # All clients of this host have one NetID: a router tells them apart by their ports.
         self._source_port = _FIRST_PORT + randbelow(_FIRST_PORT)
         self._numbers = count(1)
         self._waiting: dict[int, asyncio.Future[AmsAnswer]] = {}
@@ -169,6 +170,8 @@ class AdsConnection:
         else:
             operation = ReadWrite(IndexGroup.CONTROL, ControlOffset.REQUEST, PART, line)
         answer, head = await self._part(operation)
+        # A change of the configuration takes longer than routers wait for an answer: it is begun by
+        # one request, and others ask for its answer.
         deadline_s = asyncio.get_running_loop().time() + CONFIGURE_S
         while not head.total:
             if asyncio.get_running_loop().time() > deadline_s:
@@ -261,6 +264,7 @@ class AdsConnection:
         if station not in self._ports:
             document = await self.request("status", {})
             for each in document["stations"]:
+                # Reversed, so that the first of several ports stays.
                 for port in reversed(each["ports"]):
                     if port["kind"] == "eap":
                         self._ports[each["name"]] = NetId.parse(port["net_id"])

@@ -91,6 +91,7 @@ class LiveClient:
         await self._drop(self._connection)
 
     async def _connected(self) -> PlantConnection:
+        # Requests that find no connection at the same time wait for one.
         async with self._opening:
             if self._connection is None:
                 self._connection = await self._open()

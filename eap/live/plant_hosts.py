@@ -127,6 +127,7 @@ def link_to_hosts(plant: Plant, file: Path, *, local: bool = False) -> Iterator[
         remote: dict[str, RemoteAppliance] = {}
         away: list[AwayHost] = []
         for host in plant.hosts:
+            # Stations of another host may run here, as in a trial of the plant on one computer.
             missing = [name for name in host.stations if name not in clients]
             if not missing:
                 continue
@@ -206,6 +207,8 @@ def _notes(remote: dict[str, RemoteAppliance]) -> Iterator[str]:
 
 def _as_installed(plant: Plant, file: Path, remote: dict[str, RemoteAppliance]) -> Plant:
     """Return *plant* with the files of remote stations where their hosts have them."""
+    # Paths in the file begin at its folder, which is another one on another host: compared with the
+    # paths of here, each such file would be a difference.
     own = file.resolve().parent
     folders = {
         name: Path(client.info.plant_file).parent

@@ -133,6 +133,7 @@ class UnixConnection:
         self._last_id += 1
         number = self._last_id
         answer: asyncio.Future[ControlReply] = asyncio.get_running_loop().create_future()
+        # Before the request is written: its answer may come while drain() waits.
         self._waiting[number] = answer
         try:
             self._writer.write(encode_request(number, method, params))

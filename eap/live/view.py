@@ -158,6 +158,7 @@ class LiveView:
             await self._find_local()
         waiting = [source.ask() for source in self._sources.values()]
         if waiting:
+            # Not wait_for(): a late request goes on, and its answer is in the next report.
             await asyncio.wait(waiting, timeout=within_s or self._answer_s)
         at_ns, now_s = time.monotonic_ns(), time.time()
         silent = [

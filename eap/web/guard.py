@@ -150,6 +150,7 @@ class Guard:
 
     def host_of(self, request: web.Request) -> str:
         """Return the address of the client, also behind the proxy."""
+        # The last entry is the proxy's own; those before it may be made up by the client.
         forwarded = request.headers.get("X-Forwarded-For", "").rpartition(",")[2].strip()
         if forwarded and self._is_proxy(request):
             return forwarded[:64]
@@ -228,6 +229,7 @@ class Guard:
         limiter = self._rates.get(key)
         if limiter is None:
             limiter = self._rates[key] = RateLimiter(*(_FILE_RATE if is_file else _RATE), now_s)
+            # Memory is bounded: a client with many addresses pushes out those quiet for longest.
             if len(self._rates) > _MAX_HOSTS:
                 self._rates.popitem(last=False)
         self._rates.move_to_end(key)
@@ -248,6 +250,7 @@ class Guard:
         return None
 
     def _identify_by_proxy(self, request: web.Request, name: str) -> web.Response | None:
+        # From any other host the header is a claim that nobody checked.
         if not self._is_proxy(request):
             return refusal(403, f"a user in a header is not taken from {request.remote}")
         user = self._users.get(name)
@@ -272,6 +275,8 @@ class Guard:
             separator = ""
         if scheme.lower() != "basic" or not separator:
             return refusal(401, "expected Authorization: Basic")
+        # Programs send the password with each request, and a check of it takes a tenth of a second
+        # of a core: a right one is remembered for some minutes, as a digest.
         digest = hashlib.sha256(given.encode("utf-8", "replace")).digest()
         name, until_s = self._remembered.get(digest, ("", 0.0))
         if until_s < monotonic():
@@ -303,6 +308,7 @@ class Guard:
 
 def is_browser(request: web.Request) -> bool:
     """Return whether a browser sent a request, and no program."""
+    # A page of another site makes browsers send requests, never programs: these need no token.
     headers = request.headers
     return "Origin" in headers or "Sec-Fetch-Site" in headers or bool(request.get(TOKEN))
 

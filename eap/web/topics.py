@@ -164,6 +164,7 @@ class PageTopics:
                 for period_ms in periods:
                     if topic.names[period_ms]:
                         self._send(topic, TopicPart(topic.name, period_ms))
+            # After a delay the next round is due at once; those that were missed are not made up.
             due_s = max(due_s + FAST_MS / 1000, clock())
             await asyncio.sleep(due_s - clock())
 
@@ -180,6 +181,7 @@ class PageTopics:
             self._send(topic, TopicPart(EVENTS, SLOW_MS))
 
     def _send(self, topic: _Topic, part: TopicPart) -> None:
+        # Encoded once: the cost of a page does not grow with the browsers that show it.
         message = topic.latest[part] = self._encode(topic, part)
         for client in topic.clients:
             client.put(part, message)
@@ -234,6 +236,7 @@ class PageTopics:
         for pattern, window_s in self._windows.items():
             for name in self._feed.resolve([pattern]):
                 windows[name] = max(windows.get(name, 0), window_s)
+        # A trend keeps its past while pages and stations change, unless its window does.
         self.histories = {
             name: kept
             if (kept := self.histories.get(name)) is not None and kept.window_s == window_s
