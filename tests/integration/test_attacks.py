@@ -20,7 +20,7 @@ from base64 import b64encode
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import pytest
 
@@ -47,6 +47,61 @@ OVEN_ID, PANEL_ID, BUS_ID = f"{OVEN}.2.1", f"{PANEL}.2.1", f"{OVEN}.3.1"
 WEB, OPCUA = (OVEN, 8443), f"opc.tcp://{OVEN}:4840/"
 DENIED = 0x723
 (ADD_ROUTE, SERVER_INFO) = (vector.octets for vector in load("ams_discovery"))
+
+
+CERTIFICATES = """exec 2>/dev/null
+own() {
+    openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj "/CN=$2" -keyout $1.key -out $1.crt
+}
+signed() {
+    openssl req -newkey rsa:2048 -nodes -subj /CN=$2 -keyout $1.key -out $1.csr
+    openssl x509 -req -in $1.csr -CA $3.crt -CAkey $3.key -CAcreateserial -days 2 -out $1.crt
+}
+own works 'works CA'
+signed oven oven works
+signed anna anna works
+own evil anna
+own other 'other CA'
+signed rogue anna other
+"""
+
+
+class SecureClient:
+    """Speaks ADS over TLS with the certificate *name*."""
+
+    def __init__(self, plain: socket.socket, folder: Path, name: str, flags: int = 0) -> None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.check_hostname = False
+        context.load_verify_locations(folder / "works.crt")
+        if name:
+            context.load_cert_chain(folder / f"{name}.crt", folder / f"{name}.key")
+        self._socket = context.wrap_socket(plain)
+        head = struct.pack("<HHBB6s20x", 64, flags, 1, 0, bytes([10, 9, 9, 9, 1, 1]))
+        self._socket.sendall(head + b"attack".ljust(32, b"\0"))
+        self.error = self._exactly(64)[5]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def ask(
+        self, target: str, command: int, body: bytes, *, port: int = aoe.DEVICE
+    ) -> tuple[int, bytes]:
+        """Return the error in the AMS header and the data of an answer."""
+        self._socket.sendall(aoe.packet(target, command, body, port=port))
+        head = self._exactly(32)
+        length, error = struct.unpack_from("<II", head, 20)
+        return error, self._exactly(length)
+
+    def _exactly(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size:
+            if not (more := self._socket.recv(size - len(data))):
+                raise ConnectionError(f"closed after {len(data)} of {size} bytes")
+            data += more
+        return data
 
 
 class Site(NamedTuple):
@@ -91,6 +146,10 @@ class Site(NamedTuple):
         sock = self.there.socket(socket.AF_INET, socket.SOCK_STREAM)
         sock.bind((source, 0))
         return AmsClient(OVEN, sock)
+
+    def engineer(self) -> SecureClient:
+        """Return a client with the certificate of the engineer."""
+        return SecureClient(self.tcp(ENGINEER, 8016), self.folder, "anna")
 
     def page(
         self, method: str, path: str, source: str = ATTACKER, body: object = None, **headers: str
@@ -141,6 +200,7 @@ def _start(farm: Plants, here: Namespace, there: Namespace) -> Site:
          "-keyout", folder / "page.key", "-out", folder / "page.crt"],
         check=True, capture_output=True,
     )  # fmt: skip
+    subprocess.run(["sh", "-e"], input=CERTIFICATES, text=True, check=True, cwd=folder)
     run_eapctl(folder, "keys", "new", str(folder / "plant.keys"))
     checked = run_eapctl(folder, "check", "--security", str(plant))
     assert (checked.returncode, "open" in checked.stdout + checked.stderr) == (0, False)
@@ -231,7 +291,7 @@ def test_cut_line_ages_the_values_and_is_counted(site: Site) -> None:
 # ADS
 
 
-def write(client: AmsClient, target: str = OVEN_ID, port: int = aoe.DEVICE) -> int:
+def write(client: AmsClient | SecureClient, target: str = OVEN_ID, port: int = aoe.DEVICE) -> int:
     """Return the error or result of a write of an object."""
     error, data = client.ask(target, aoe.WRITE, aoe.write_body(0x8000_0001, b"\1\0"), port=port)
     return error or int.from_bytes(data[:4], "little")
@@ -282,13 +342,31 @@ def test_host_with_a_known_address_reads_and_does_no_more(site: Site) -> None:
         assert write(client) == DENIED
 
 
-def test_address_of_the_engineer_is_proof_of_nothing_but_is_audited(site: Site) -> None:
-    """Success of the attacker: a host with the address of the engineer is the engineer."""
+def test_engineer_is_known_by_the_certificate_and_not_by_the_address(site: Site) -> None:
     with site.ams(ENGINEER) as client:
-        write(client, BUS_ID, 1001)
+        assert write(client, BUS_ID, 1001) == DENIED
+    with site.engineer() as client:
+        assert client.error == 0
+        assert write(client, BUS_ID, 1001) != DENIED
     line = site.audit()[-1]
-    assert line["from"].startswith(ENGINEER)
-    assert (line["allowed"], line["why"]) == (True, "rule engineers allows it")
+    assert (line["transport"], line["why"]) == ("ams-tls:anna", "rule engineers allows it")
+
+
+@pytest.mark.parametrize(
+    ("name", "flags", "counter"),
+    [
+        ("", 0, "tls_certificate"),
+        ("rogue", 0, "tls_certificate"),
+        ("evil", 0x10, "tls_fingerprint"),
+    ],
+)
+def test_secure_ads_refuses_others(site: Site, name: str, flags: int, counter: str) -> None:
+    before = site.oven.station("oven")["discarded"].get(counter, 0)
+    with suppress(OSError), SecureClient(site.tcp(ATTACKER, 8016), site.folder, name, flags) as one:
+        assert one.error != 0
+        one.ask(OVEN_ID, aoe.READ_STATE, b"")
+        raise AssertionError("answered")
+    wait_until(lambda: site.oven.station("oven")["discarded"].get(counter, 0) > before)
 
 
 def test_flood_of_connections_leaves_room_for_others(site: Site) -> None:
@@ -364,7 +442,7 @@ def test_flood_of_the_gateway_is_denied_and_audited_within_limits(site: Site) ->
         for _ in range(3000):
             sock.sendto(frame, (OVEN, 34980))
         assert sock.recv(2048)[10:11] == b"\x80"  # abort
-    with site.ams(ENGINEER) as client:
+    with site.engineer() as client:
         error, data = client.ask(BUS_ID, aoe.READ, aoe.read_body(0x1018_0001, 4), port=1001)
         assert (error, data[:4]) == (0, bytes(4))
     assert 0 < len(site.audit()) - lines < 1200
@@ -376,7 +454,7 @@ def test_path_traversal_by_foe_finds_nothing(site: Site, name: str) -> None:
     """Even an engineer reaches the files of the slave only."""
     data = name.encode()
     body = struct.pack("<IIII", IndexGroup.FOE_OPEN_READ, 0, 4, len(data)) + data
-    with site.ams(ENGINEER) as client:
+    with site.engineer() as client:
         error, answer = client.ask(BUS_ID, 9, body, port=1001)
     assert error or int.from_bytes(answer[:4], "little")
 
