@@ -100,7 +100,8 @@ def list_all(station: str | None, match: str, plant: str | None, output: Rendere
     "--via",
     required=True,
     metavar="VIA",
-    help="STATION/PORT of the plant, or ams-tcp:HOST[:PORT], udp:ADDRESS, tcp:ADDRESS,"
+    help="STATION/PORT of the plant, or ams-tcp:HOST[:PORT], ams-tls:HOST[:PORT], udp:ADDRESS,"
+    " tcp:ADDRESS,"
     " ethernet:MAC, mqtt:NETWORK.",
 )
 @click.option("--port", default="", metavar="PORT", help="EAP port of STATION to send from.")
@@ -126,6 +127,15 @@ def list_all(station: str | None, match: str, plant: str | None, output: Rendere
     help="Timeout of an answer.",
 )
 @click.option("--no-probe", is_flag=True, help="Do not probe the next hop.")
+@click.option(
+    "--fingerprint",
+    default="",
+    metavar="HEX",
+    help="SHA-256 of the next hop's certificate (ams-tls); else an authority of STATION signed it.",
+)
+@click.option(
+    "--any-name", is_flag=True, help="Its certificate need not name the host of --via (ams-tls)."
+)
 @plant_option
 @json_option("Print one object: the route and warnings.")
 def add(
@@ -139,6 +149,8 @@ def add(
     unidirectional: bool,
     timeout_ms: int | None,
     no_probe: bool,
+    fingerprint: str,
+    any_name: bool,
     plant: str | None,
     output: Renderer,
 ) -> None:
@@ -155,7 +167,8 @@ def add(
         added = client.call(
             ROUTES_ADD, station=station, name=name, net_id=net_id, via=via, port=port,
             octets=int(octets), virtual=virtual, unidirectional=unidirectional,
-            timeout_ms=timeout_ms or 0, probed=not no_probe,
+            timeout_ms=timeout_ms or 0, probed=not no_probe, fingerprint=fingerprint,
+            check_name=not any_name,
         )  # fmt: skip
     route = added.route
     output.show(added, lambda _: f"{station}: added {name} ({route.net_id}, {path_of(route)})")

@@ -39,6 +39,10 @@ class StaticRoute(NamedTuple):
     is_unidirectional: bool = False
     security: str = ""
     """Names of the elements that protect the connection: ``Tls``, ``Psk``."""
+    has_ca: bool = False
+    """True if ``Tls`` names an authority (``Ca``)."""
+    ignores_name: bool = False
+    """True if the certificate need not name the host (``IgnoreCn``)."""
 
 
 class StaticBroker(NamedTuple):
@@ -113,6 +117,7 @@ def dump(
 
 
 def _route(element: XmlElement) -> StaticRoute:
+    tls = element.find("Tls")
     return StaticRoute(
         element.findtext("Name"),
         element.findtext("NetId"),
@@ -122,6 +127,8 @@ def _route(element: XmlElement) -> StaticRoute:
         element.findtext("Timeout")[:_MAX_KEPT],
         element.attribute_flag("Unidirectional"),
         ", ".join(tag for tag in ("Tls", "Psk") if element.find(tag) is not None),
+        bool(element.findtext("Tls/Ca")),
+        tls is not None and tls.attribute_flag("IgnoreCn"),
     )
 
 

@@ -13,7 +13,7 @@ from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.structs import RouteSection, SecureAdsSection, StationSection, TlsSection
 
-_FINGERPRINT = "SHA-256 in hexadecimal, as eapctl routes certificate shows it"
+_FINGERPRINT = "that of 'openssl x509 -in FILE -noout -fingerprint -sha256'"
 _NAME = "a name of up to 64 characters without colons"
 _MAX_NAME = 64
 _PSK_FROM = (3, 13)

@@ -46,7 +46,7 @@ class RoutesAddParameters(Parameters, frozen=True, kw_only=True):
         name: Name for people.
         net_id: NetID of the target; empty if *name* is a station of the plant.
         via: Next hop: ``STATION/PORT`` of the plant, or a kind of transport and an address, such as
-            ``ams-tcp:192.168.1.5``, ``udp:10.0.0.5``, ``mqtt:NETWORK``.
+            ``ams-tcp:192.168.1.5``, ``ams-tls:plc.hall``, ``udp:10.0.0.5``, ``mqtt:NETWORK``.
         port: Local EAP port of the transport; empty for the first that fits.
         octets: Number of bytes of *net_id* that must match; 0 for a default route.
         virtual: NetID of the target in requests; empty for its own.
@@ -54,6 +54,9 @@ class RoutesAddParameters(Parameters, frozen=True, kw_only=True):
         timeout_ms: Time limit of an answer; 0 for the default.
         probed: Whether the next hop is probed from time to time.
         replaces: Name or NetID of an added route that this one replaces; empty for none.
+        fingerprint: By Secure ADS: SHA-256 of the certificate of the next hop; empty if an
+            authority of the station signed it.
+        check_name: Whether such a certificate has to name the host of *via*.
     """
 
     station: str
@@ -67,6 +70,8 @@ class RoutesAddParameters(Parameters, frozen=True, kw_only=True):
     timeout_ms: Annotated[int, Meta(ge=0, le=600_000)] = 0
     probed: bool = True
     replaces: Text = ""
+    fingerprint: Text = ""
+    check_name: bool = True
 
 
 class RoutesRemoveParameters(Parameters, frozen=True, kw_only=True):

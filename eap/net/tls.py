@@ -123,7 +123,10 @@ def server_context(spec: SecureAdsSpec) -> ServerContext:
     # A pinned certificate, or that of an intermediate authority, is enough.
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
     _load(context, spec.certificate, spec.key, spec.ca)
-    context.load_dh_params(str(_DH_PARAMETERS))
+    try:
+        context.load_dh_params(str(_DH_PARAMETERS))
+    except OSError as exc:
+        raise EnvironmentalError(f"{_DH_PARAMETERS}: {_file_error(exc)}") from None
     if keys:
         # Python 3.11 has no such method.
         set_callback: Callable[..., None] = getattr(context, "set_psk_server_callback")  # noqa: B009

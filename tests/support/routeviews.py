@@ -64,7 +64,8 @@ class Left:
 
     def _open(self, hop: HopSpec) -> Endpoint:
         name = f"{hop.kind}:{hop.port or hop.address}"
-        if hop.kind is TransportKind.AMS_TCP and name not in self._transports():
+        is_uplink = hop.kind in {TransportKind.AMS_TCP, TransportKind.AMS_TLS}
+        if is_uplink and name not in self._transports():
             self.router.add_transport(Transport(name, is_stream=True), self.sender)
         if name not in self._transports():
             raise ValueError(f"this station has no transport {name}")

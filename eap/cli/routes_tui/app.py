@@ -351,13 +351,13 @@ _KEPT_ELSEWHERE = {
 _FIELDS = {
     "name": ("Name", "press"),
     "net_id": ("NetID", "5.1.2.3.1.1; may be empty for a station of the plant"),
-    "via": ("Via", "STATION/PORT, ams-tcp:HOST, udp:ADDRESS, mqtt:NETWORK"),
+    "via": ("Via", "STATION/PORT, ams-tcp:HOST, ams-tls:HOST, udp:ADDRESS, mqtt:NETWORK"),
     "port": ("EAP port", "to leave by; may be empty"),
     "octets": ("Bytes", "of the NetID that must match: 4, 5 or 6; 0 for a default route"),
     "virtual": ("Virtual", "NetID that it has here (NAT); may be empty"),
     "timeout_ms": ("Time-out", "of an answer, in ms; may be empty"),
 }
-_KINDS_WITHOUT_PORT = {"ams-tcp", "mqtt"}
+_KINDS_WITHOUT_PORT = {"ams-tcp", "ams-tls", "mqtt"}
 
 
 class Tick(Checkbox):

@@ -11,11 +11,12 @@ from typing import Any
 import msgspec
 
 from eap.ams.directory import AmsAddress, Directory, parse_via
-from eap.ams.spec import MqttSpec, RouteSpec, TransportKind
+from eap.ams.spec import MqttSpec, RouteSpec, SecureRouteSpec, TransportKind
 from eap.codec import staticroutes
 from eap.codec.ads import AdsError
 from eap.codec.ams import AMS_TCP_PORT
 from eap.codec.staticroutes import TCP_IP, StaticBroker, StaticRoute
+from eap.codec.tlshandshake import parse_fingerprint
 from eap.control import device as device_records
 from eap.control import routes as records
 from eap.control.bus import to_octets
@@ -281,17 +282,24 @@ class RouteMethods:
     async def _import_one(
         self, view: RouterView, route: StaticRoute, *, dry_run: bool
     ) -> records.ImportRow:
-        via, reason = f"{TransportKind.AMS_TCP}:{route.address}", ""
+        secure = view.routes.spec.secure
+        by_authority = route.security == "Tls" and route.has_ca and bool(secure and secure.ca)
+        kind = TransportKind.AMS_TLS if by_authority else TransportKind.AMS_TCP
+        via, reason = f"{kind}:{route.address}", ""
         wanted = records.RoutesAddParameters(
             station=view.router.name,
             name=route.name,
             net_id=route.net_id,
             via=via,
             unidirectional=route.is_unidirectional,
+            check_name=not route.ignores_name,
         )
-        if route.security:
+        if route.security and not by_authority:
             # Without it the packets would cross the network in clear text.
-            reason = f"it is protected by {route.security}, which AMS/TCP has not here"
+            reason = (
+                f"it is protected by {route.security}: add it with 'eapctl routes add --via"
+                f" ams-tls:{route.address}', or with tls to the plant file"
+            )
         elif route.type != TCP_IP:
             reason = f"its type is {route.type!r}, expected {TCP_IP}"
         elif not route.address or not route.net_id or not route.name:
@@ -327,6 +335,7 @@ class RouteMethods:
                 wanted.via, net_id, self._directory.stations[wanted.station], self._directory,
                 port=wanted.port,
             )  # fmt: skip
+            tls = self._tls(wanted, hop.kind)
         except ValueError as exc:
             raise ControlError(str(exc), code=ErrorCode.VALUE) from None
         beside = self._directory.stations.get(wanted.via.partition("/")[0])
@@ -340,7 +349,29 @@ class RouteMethods:
             is_unidirectional=wanted.unidirectional,
             timeout_ms=wanted.timeout_ms,
             is_probed=wanted.probed,
+            tls=tls,
         )
+
+    def _tls(
+        self, wanted: records.RoutesAddParameters, kind: TransportKind
+    ) -> SecureRouteSpec | None:
+        """Return TLS of a route; raise ValueError if it cannot work."""
+        if kind is not TransportKind.AMS_TLS:
+            if wanted.fingerprint:
+                raise ValueError(f"a fingerprint is for ams-tls:HOST, not for {wanted.via}")
+            return None
+        own = self._view(wanted.station).routes.spec.secure
+        if own is None:
+            raise ValueError(
+                f"station {wanted.station} has no certificate for {wanted.via}: write secure_ads"
+                " into the plant file"
+            )
+        if not wanted.fingerprint and not own.ca:
+            raise ValueError(
+                f"{wanted.via} needs a fingerprint: secure_ads of {wanted.station} has no ca"
+            )
+        fingerprint = parse_fingerprint(wanted.fingerprint) if wanted.fingerprint else ""
+        return SecureRouteSpec(fingerprint=fingerprint, check_name=wanted.check_name)
 
     def _net_id(self, wanted: records.RoutesAddParameters) -> str:
         """Return the NetID of a route; raise ValueError if there is none."""

@@ -48,7 +48,8 @@ FILE = """\
 """
 PRESS = StaticRoute("press", "192.168.1.21.1.1", "press.hall", flags="64", timeout="5")
 SAFE = StaticRoute(
-    "safe", "1.2.3.4.1.1", "1.2.3.4", is_unidirectional=True, security="Tls"
+    "safe", "1.2.3.4.1.1", "1.2.3.4",
+    is_unidirectional=True, security="Tls", has_ca=True, ignores_name=True,
 )  # fmt: skip
 BROKERS = [
     StaticBroker("broker", 1884, "line"),
@@ -79,7 +80,7 @@ def test_brokers_are_read_without_their_secrets() -> None:
 
 def test_brokers_are_written_without_secrets() -> None:
     written = parse(dump("here", "1.1.1.1.1.1", [SAFE], BROKERS, tcp_port=48898))
-    assert written.routes == [SAFE._replace(security="")]
+    assert written.routes == [SAFE._replace(security="", has_ca=False, ignores_name=False)]
     assert written.brokers == [
         BROKERS[0],
         BROKERS[1]._replace(has_secret=False),
@@ -118,7 +119,9 @@ def test_other_files_are_refused(text: str, reason: str) -> None:
 
 
 ROUTES = st.builds(
-    StaticRoute, NAMES, NAMES, NAMES, st.just("TCP_IP"), NAMES, NAMES, st.booleans(), st.just("")
+    StaticRoute,
+    *(NAMES, NAMES, NAMES, st.just("TCP_IP"), NAMES, NAMES, st.booleans()),
+    *(st.just(""), st.just(False), st.just(False)),
 )
 
 

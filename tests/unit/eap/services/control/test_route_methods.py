@@ -5,9 +5,18 @@ from ipaddress import IPv4Address
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from eap.ams.routes import Origin, Route
-from eap.ams.spec import MqttSpec, RoutingSpec, TlsSpec
+from eap.ams.spec import (
+    HopSpec,
+    MqttSpec,
+    RoutingSpec,
+    SecureAdsSpec,
+    SecureRouteSpec,
+    TlsSpec,
+    TransportKind,
+)
 from eap.codec.staticroutes import StaticBroker, StaticRoute, dump, parse
 from eap.errors import ControlError, EnvironmentalError
 from eap.ids import Endpoint, NetId
@@ -17,6 +26,7 @@ from tests.support.routeviews import DIRECTORY, Left
 from tests.support.routing import while_serving
 from tests.support.virtualtime import run_virtual
 
+SECURE = SecureAdsSpec(certificate="/own.crt", key="/own.key", ca="/ca.crt")
 PLC = {"station": "left", "name": "plc", "net_id": "5.1.2.3.1.1", "via": "ams-tcp:10.0.0.5"}
 
 
@@ -184,8 +194,36 @@ def test_import_does_not_open_a_protected_route_in_clear_text(ask, left):
     xml = dump("x", "1.1.1.1.1.1", [StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5")], tcp_port=48898)
     xml = xml.replace("</Route>", "<Tls><Ca>ca.crt</Ca><Key>secret-1</Key></Tls></Route>")
     (row,) = ask("import", station="left", xml=xml)
-    assert row.reason == "it is protected by Tls, which AMS/TCP has not here"
+    assert row.reason == (
+        "it is protected by Tls: add it with 'eapctl routes add --via ams-tls:10.0.0.5', or with"
+        " tls to the plant file"
+    )
     assert names(left) == ["right"]
+
+
+def test_import_adds_a_route_by_an_authority_where_the_station_has_one(ask, left):
+    left.routes.replace_spec(RoutingSpec(secure=SECURE))
+    xml = dump("x", "1.1.1.1.1.1", [StaticRoute("plc", "5.1.2.3.1.1", "10.0.0.5")], tcp_port=48898)
+    xml = xml.replace("</Route>", '<Tls IgnoreCn="true"><Ca>ca.crt</Ca></Tls></Route>')
+    (row,) = ask("import", station="left", xml=xml)
+    assert (row.reason, row.via) == ("", "ams-tls:10.0.0.5")
+    (added,) = left.routes.added
+    assert added.hop == HopSpec(TransportKind.AMS_TLS, "", "10.0.0.5:8016")
+    assert added.tls == SecureRouteSpec(check_name=False)
+    xml = xml.replace("<Ca>ca.crt</Ca>", "")  # self-signed
+    assert "protected by Tls" in ask("import", station="left", xml=xml)[0].reason
+
+
+def test_route_by_secure_ads_needs_a_certificate_and_trust(ask, left):
+    tls = PLC | {"via": "ams-tls:10.0.0.5"}
+    assert "station left has no certificate for ams-tls" in refused(ask, "add", **tls)[1]
+    left.routes.replace_spec(RoutingSpec(secure=replace(SECURE, ca="")))
+    assert "needs a fingerprint: secure_ads of left has no ca" in refused(ask, "add", **tls)[1]
+    assert "'xy' is no SHA-256" in refused(ask, "add", **tls, fingerprint="xy")[1]
+    assert "not for ams-tcp:10.0.0.5" in refused(ask, "add", **PLC, fingerprint="ab" * 32)[1]
+    row = ask("add", **tls, fingerprint="ab" * 32).route
+    assert row.transport == "ams-tls:10.0.0.5:8016"
+    assert left.routes.added[0].tls == SecureRouteSpec(fingerprint=":".join(["AB"] * 32))
 
 
 def test_import_names_the_plant_file_entry_of_a_broker(ask, left):

@@ -15,6 +15,7 @@ import pytest
 from eap.ams.spec import (
     AmsUser,
     HopSpec,
+    PskSpec,
     RouteSpec,
     RoutingSpec,
     SecureAdsSpec,
@@ -22,7 +23,9 @@ from eap.ams.spec import (
     SecureRouteSpec,
     TransportKind,
 )
+from eap.codec.secureads import psk_of
 from eap.net.limits import ListenerLimits, Rate, SourceRates
+from eap.net.tls import HAS_PSK
 from eap.runtime.drop_counters import DropReason
 from eap.runtime.store import StationStore
 from eap.services.routing.station_routes import StationRoutes
@@ -114,7 +117,10 @@ class Server:
         transports: Names of those that the router has.
     """
 
-    def __init__(self, keys: Keys, *, peers: tuple[SecurePeer, ...] | None = None, **told) -> None:
+    def __init__(
+        self, keys: Keys, *, peers: tuple[SecurePeer, ...] | None = None,
+        psk: tuple[PskSpec, ...] = (), **told,
+    ) -> None:  # fmt: skip
         if peers is None:
             peers = (SecurePeer("pinned", keys.pinned.fingerprint),)
         spec = SecureAdsSpec(
@@ -122,6 +128,7 @@ class Server:
             key=str(keys.server.key),
             ca=str(keys.ca.certificate),
             peers=peers,
+            psk=psk,
         )
         self.router = station(OWN, name="left")
         self.transports: set[str] = set()
@@ -409,3 +416,33 @@ def test_far_end_of_a_route_is_known_unless_the_route_is_unidirectional(keys: Ke
         route("shy", "1.2.3.5.1.1", keys.pinned, is_unidirectional=True),
     )
     assert play(script, keys, peers=(), routes=routes).refused == [DropReason.TLS_FINGERPRINT]
+
+
+@pytest.mark.skipif(not HAS_PSK, reason="pre-shared keys need Python 3.13 or newer")
+@pytest.mark.parametrize(
+    ("identity", "password", "is_known"),
+    [("Panel-1", b"timber", True), ("panel-1", b"wrong", False), ("nobody", b"timber", False)],
+)
+def test_pre_shared_key_names_its_client(
+    keys: Keys, tmp_path, identity: str, password: bytes, is_known: bool
+) -> None:
+    (tmp_path / "secret").write_text("timber\n")
+    context = client_context(None, ciphers="PSK-AES128-CBC-SHA256")
+    key = psk_of(identity, password)
+    context.set_psk_client_callback(lambda hint: (identity, key))
+
+    async def script(server: Server) -> None:
+        try:
+            reader, writer = await asyncio.open_connection(*server.address, ssl=context)
+        except OSError:
+            await eventually(lambda: server.refused)
+            return
+        writer.write(hello())
+        assert (await reader.readexactly(64))[5] == 0
+        await read_state(reader, writer)
+        assert server.transports == {"ams-tls:panel-1"}
+        writer.close()
+
+    psk = (PskSpec("panel-1", str(tmp_path / "secret")),)
+    refused = [] if is_known else [DropReason.TLS_HANDSHAKE]
+    assert play(script, keys, psk=psk).refused == refused
