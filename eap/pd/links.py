@@ -248,14 +248,19 @@ def _generator_step(image: Image, source: EngineSource) -> Callable[[int], None]
     if isinstance(source, RandomSource):
         return _random_step(image, source, slot.bit_offset // 8, kind.size)
     limits = kind.scalar_range
-    whole = limits is not None and isinstance(limits[0], int)
-    value = _generator_value(source, image.layout.cycle_us, finish=round if whole else float)
     store = image.storer(slot.name)
-    if limits is None or not whole:
-        return lambda tick: store(value(tick))
+    if limits is None or not isinstance(limits[0], int):
+        return _number_step(source, image.layout.cycle_us, store)
     low, span = int(limits[0]), int(limits[1]) - int(limits[0]) + 1
+
     # Whole numbers wrap as the counter of a controller does, instead of staying at a limit.
-    return lambda tick: store((value(tick) - low) % span + low)
+    def wrap(value: float) -> None:
+        store((round(value) - low) % span + low)
+
+    if isinstance(source, CounterSource):
+        step = source.step
+        return lambda tick: store((tick * step - low) % span + low)
+    return _number_step(source, image.layout.cycle_us, wrap)
 
 
 @lru_cache(maxsize=32)
@@ -283,18 +288,17 @@ def _random_step(
     return fill
 
 
-def _generator_value(
-    source: CounterSource | RampSource | SineSource,
-    cycle_us: int,
-    *,
-    finish: Callable[[float], Any],
-) -> Callable[[int], Any]:
+def _number_step(
+    source: CounterSource | RampSource | SineSource, cycle_us: int, store: Callable[[float], None]
+) -> Callable[[int], None]:
+    # One function for each step and no function within it: a plant has hundreds of such variables.
     if isinstance(source, CounterSource):
-        return lambda tick: finish(tick * source.step)
+        step = source.step
+        return lambda tick: store(float(tick * step))
     period = max(source.period_ms * 1000 / cycle_us, 1.0)
     if isinstance(source, RampSource):
-        span = source.high - source.low
-        return lambda tick: finish(source.low + span * (tick % period) / period)
-    turn = 2 * math.pi / period
+        low, span = float(source.low), source.high - source.low
+        return lambda tick: store(low + span * (tick % period) / period)
+    turn, offset, amplitude, sine = 2 * math.pi / period, source.offset, source.amplitude, math.sin
     # The remainder keeps the argument small: the sine of a large float has lost its precision.
-    return lambda tick: finish(source.offset + source.amplitude * math.sin(turn * (tick % period)))
+    return lambda tick: store(offset + amplitude * sine(turn * (tick % period)))
