@@ -2,7 +2,7 @@
 
     0xD000:07 = UDINT 10000  # Cycle time, us, 0x2710
 
-Behind the type stands the value as ``od write`` takes it, a text in quotes as in JSON; octets that
+Behind the type stands the value as ``od write`` takes it, a text in quotes as in JSON; bytes that
 no value stands for are written as ``hex`` and their digits.  The rest of the line is for people.
 """
 

@@ -126,6 +126,7 @@ def frame_length(buffer: Buffer) -> int | None:
     if len(buffer) < 6:
         return None
     _, protocol, length = struct.unpack_from(">HHH", buffer)
+    # The length counts the unit identifier, too.
     if protocol or not 2 <= length <= MAX_PDU + 1:
         raise MalformedError(f"protocol {protocol}, length {length}", layout="MBAP")
     return 6 + int(length)
@@ -192,6 +193,7 @@ ModbusRequest = ModbusRead | ModbusWrite | ModbusMask | ModbusReadWrite
 
 def write_request(table: ModbusTable, first: int, count: int, data: bytes) -> ModbusWrite:
     """Return the request that writes: the one for a single value where it is one."""
+    # Small devices often lack the functions for several values.
     if table is ModbusTable.COILS:
         function = ModbusFunction.WRITE_COIL if count == 1 else ModbusFunction.WRITE_COILS
     else:
@@ -302,6 +304,7 @@ def decode_reply(pdu: bytes, request: bytes) -> ModbusReply:
         return ModbusReply(exception=pdu[1])
     if not pdu or pdu[0] != function:
         raise MalformedError(f"reply {pdu[:2].hex()} to function {function}", layout="Modbus")
+    # A confirmation of a write repeats the request and says nothing more.
     if function not in _TABLES:
         return ModbusReply()
     if len(pdu) < 2 or len(pdu) < 2 + pdu[1]:

@@ -181,6 +181,7 @@ class S7Item(NamedTuple):
 
     def encode(self) -> bytes:
         """Return the address."""
+        # 0x12: specification of a variable, 0x0A: bytes that follow, 0x10: syntax S7ANY.
         place = self.start.to_bytes(3, "big")
         head = 0x12, 0x0A, 0x10, self.transport_size, self.number, self.block, self.area
         return struct.pack(">BBBBHHB", *head) + place
@@ -237,6 +238,7 @@ class CotpConnect(NamedTuple):
 
     def encode(self) -> bytes:
         """Return the packet."""
+        # 0xC0: size of TPDUs as a power of 2; 0xC1 and 0xC2: calling and called TSAP (RFC 905).
         options = b"".join(
             bytes((code, len(data))) + data
             for code, data in (
@@ -336,6 +338,7 @@ def encode_item_data(
         if code != ItemCode.DONE:
             out += bytes((code, 0, 0, 0))
             continue
+        # A bit takes a whole byte, but its length is that of one bit.
         kind, length = (_DATA_BIT, len(data)) if item.is_bit else (_DATA_BYTES, 8 * len(data))
         out += struct.pack(">BBH", 0 if is_request else code, kind, length) + data
     return bytes(out)

@@ -65,7 +65,7 @@ class _StationAddress(NamedTuple):
     name: str
     interface: str
     net_id: str
-    """Without the last two octets: 1.1 is the router's, 2.1 that of the port."""
+    """Without the last two bytes: 1.1 is the router's, 2.1 that of the port."""
 
 
 def plant_text(

@@ -24,7 +24,7 @@ from eap.od.dictionary import extract_bits
 _PLAIN_SIZES = (1, 2, 4, 8)
 
 Download: TypeAlias = tuple[int, int, bytes]
-"""Index, subindex and octets."""
+"""Index, subindex and bytes."""
 
 CONTROL = 0xF200
 """Requests to a device are no part of its configuration."""
@@ -231,7 +231,7 @@ def write_entry(
     if kind is None:
         raise ConfigError(
             f"{name}: the device does not describe its type: give it with --type, such as UINT, or"
-            " write octets with --hex"
+            " write bytes with --hex"
         )
     try:
         octets = notation.parse(kind, text)
