@@ -33,7 +33,7 @@ _RESERVED = range(19_000, 20_000)
 """Field numbers that protobuf keeps for itself."""
 
 
-class FieldType(IntEnum):
+class ProtobufType(IntEnum):
     """Types of fields: ``google.protobuf.FieldDescriptorProto.Type``."""
 
     DOUBLE = 1
@@ -49,13 +49,13 @@ class FieldType(IntEnum):
 
 
 _WIRE = {
-    FieldType.DOUBLE: (FIXED64, 8, "d"),
-    FieldType.FLOAT: (FIXED32, 4, "f"),
-    FieldType.FIXED64: (FIXED64, 8, "Q"),
-    FieldType.FIXED32: (FIXED32, 4, "I"),
-    FieldType.BOOL: (VARINT, 1, "?"),
-    FieldType.SFIXED32: (FIXED32, 4, "i"),
-    FieldType.SFIXED64: (FIXED64, 8, "q"),
+    ProtobufType.DOUBLE: (FIXED64, 8, "d"),
+    ProtobufType.FLOAT: (FIXED32, 4, "f"),
+    ProtobufType.FIXED64: (FIXED64, 8, "Q"),
+    ProtobufType.FIXED32: (FIXED32, 4, "I"),
+    ProtobufType.BOOL: (VARINT, 1, "?"),
+    ProtobufType.SFIXED32: (FIXED32, 4, "i"),
+    ProtobufType.SFIXED64: (FIXED64, 8, "q"),
 }
 """Wire type, bytes, and code of ``struct``, of the types of numbers."""
 
@@ -89,26 +89,26 @@ class _PartGroup(NamedTuple):
 _Part: TypeAlias = "bytes | Leaf | _PartGroup"
 
 
-_FIELD_TYPES: tuple[tuple[type[DataType], FieldType], ...] = (
-    (Boolean, FieldType.BOOL),
-    (Block, FieldType.BYTES),
-    (Text, FieldType.STRING),
-    (WideChar, FieldType.STRING),
-    (Structure, FieldType.MESSAGE),
+_PROTOBUF_TYPES: tuple[tuple[type[DataType], ProtobufType], ...] = (
+    (Boolean, ProtobufType.BOOL),
+    (Block, ProtobufType.BYTES),
+    (Text, ProtobufType.STRING),
+    (WideChar, ProtobufType.STRING),
+    (Structure, ProtobufType.MESSAGE),
 )
 
 
-def field_type(kind: DataType) -> FieldType:
+def field_type(kind: DataType) -> ProtobufType:
     """Return the protobuf type of a value without parts."""
     if isinstance(kind, Real):
-        return FieldType.FLOAT if kind.size == 4 else FieldType.DOUBLE
-    for python_type, field in _FIELD_TYPES:
+        return ProtobufType.FLOAT if kind.size == 4 else ProtobufType.DOUBLE
+    for python_type, field in _PROTOBUF_TYPES:
         if isinstance(kind, python_type):
             return field
     is_signed = isinstance(kind, Integer) and kind.signed
     if kind.size <= 4:
-        return FieldType.SFIXED32 if is_signed else FieldType.FIXED32
-    return FieldType.SFIXED64 if is_signed else FieldType.FIXED64
+        return ProtobufType.SFIXED32 if is_signed else ProtobufType.FIXED32
+    return ProtobufType.SFIXED64 if is_signed else ProtobufType.FIXED64
 
 
 def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
@@ -255,13 +255,13 @@ def write_leaf(leaf: Leaf, sample: bytearray, value: Any) -> None:
 
 _SAMPLE_CODES = {
     # REAL as a number of 32 bits: a conversion to double and back may change a NaN.
-    FieldType.DOUBLE: {8: "d"},
-    FieldType.FLOAT: {4: "I"},
-    FieldType.FIXED64: {8: "Q"},
-    FieldType.FIXED32: {1: "B", 2: "H", 4: "I"},
-    FieldType.BOOL: {1: "?"},
-    FieldType.SFIXED32: {1: "b", 2: "h", 4: "i"},
-    FieldType.SFIXED64: {8: "q"},
+    ProtobufType.DOUBLE: {8: "d"},
+    ProtobufType.FLOAT: {4: "I"},
+    ProtobufType.FIXED64: {8: "Q"},
+    ProtobufType.FIXED32: {1: "B", 2: "H", 4: "I"},
+    ProtobufType.BOOL: {1: "?"},
+    ProtobufType.SFIXED32: {1: "b", 2: "h", 4: "i"},
+    ProtobufType.SFIXED64: {8: "q"},
 }
 """Codes of ``struct`` for a value in a sample, by type and size."""
 
@@ -271,10 +271,10 @@ def _is_copied(leaf: Leaf) -> bool:
     kind = field_type(leaf.kind)
     if leaf.kind.is_bits or leaf.bit_offset % 8:
         return False
-    if kind is FieldType.BYTES:
+    if kind is ProtobufType.BYTES:
         return True
     wire = _WIRE.get(kind)
-    return wire is not None and kind is not FieldType.BOOL and leaf.kind.size == wire[1]
+    return wire is not None and kind is not ProtobufType.BOOL and leaf.kind.size == wire[1]
 
 
 class _Packer:
@@ -345,9 +345,9 @@ def _source_code(run: Sequence[Leaf], size: int) -> str:
 
 def _target_code(run: Sequence[Leaf], size: int) -> str:
     kind = field_type(run[0].kind)
-    if len(run) > 1 or kind is FieldType.BYTES:
+    if len(run) > 1 or kind is ProtobufType.BYTES:
         return f"{size}s"
-    return "I" if kind is FieldType.FLOAT else _WIRE[kind][2]
+    return "I" if kind is ProtobufType.FLOAT else _WIRE[kind][2]
 
 
 def _pick(run: Sequence[Leaf], code: str) -> Callable[[bytes], Any]:
@@ -374,9 +374,9 @@ def _encode(parts: Iterable[_Part], sample: bytes) -> bytes:
         else:
             value = read_leaf(part, sample)
             kind = field_type(part.kind)
-            if kind is FieldType.STRING:
+            if kind is ProtobufType.STRING:
                 found += value.encode("utf-8", "replace")
-            elif kind is FieldType.BYTES:
+            elif kind is ProtobufType.BYTES:
                 found += value
             else:
                 found += struct.pack(f"<{_WIRE[kind][2]}", value)
@@ -410,9 +410,9 @@ class _PartReader:
 
     def _value(self, kind: DataType, end: int) -> Any:
         field = field_type(kind)
-        if field is FieldType.STRING:
+        if field is ProtobufType.STRING:
             return self._take(end - self.at, end).decode("utf-8", "replace")
-        if field is FieldType.BYTES:
+        if field is ProtobufType.BYTES:
             return self._take(kind.size, end)
         _, size, code = _WIRE[field]
         return struct.unpack(f"<{code}", self._take(size, end))[0]
@@ -526,7 +526,7 @@ class StationMessages:
         """Return the ``google.protobuf.FileDescriptorSet`` that describes the messages."""
         types = _MessageTypes(self.schema_name.rpartition(".")[2])
         names = field_names((variable.name for variable in self.variables), [CYCLE_FIELD])
-        fields = [_field_descriptor(CYCLE_FIELD, 1, FieldType.FIXED64)]
+        fields = [_field_descriptor(CYCLE_FIELD, 1, ProtobufType.FIXED64)]
         for name, number, variable in zip(names, _field_numbers(2), self.variables, strict=False):
             fields.append(types.field(name, number, datatypes.parse(variable.type)))
         types.add(types.root, fields)
@@ -559,7 +559,7 @@ _OPTIONAL, _REPEATED = 1, 3
 
 
 def _field_descriptor(
-    name: str, number: int, kind: FieldType, label: int = _OPTIONAL, type_name: str = ""
+    name: str, number: int, kind: ProtobufType, label: int = _OPTIONAL, type_name: str = ""
 ) -> bytes:
     named = encode_field(6, type_name) if type_name else b""
     return (

@@ -25,7 +25,7 @@ _MAX_STATE = 255
 """Characters of a state of Home Assistant."""
 
 
-class Discovery:
+class DiscoveryDocuments:
     """Discovery documents of the stations of a plant.
 
     Args:

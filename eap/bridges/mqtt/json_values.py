@@ -9,15 +9,15 @@ import msgspec
 
 from eap.ams.mqtt.network import Publish, Subscribe
 from eap.bridges.feed import BridgeVariable, Sample
-from eap.bridges.mqtt.home_assistant import Discovery
+from eap.bridges.mqtt.home_assistant import DiscoveryDocuments
 from eap.bridges.mqtt.topics import (
     MAX_PAYLOAD,
-    Command,
     CommandError,
     Outgoing,
     PeriodicGroup,
     TopicPattern,
     WaitingValues,
+    WriteCommand,
     level,
 )
 from eap.codec import datatypes
@@ -48,7 +48,7 @@ class JsonValues:
         self._status = f"{level(plant)}/status"
         if instance != plant:
             self._status += f"/{level(instance.removeprefix(f'{plant}@'))}"
-        self._discovery = Discovery(section.discovery, plant, self._status)
+        self._discovery = DiscoveryDocuments(section.discovery, plant, self._status)
         self._groups = [(each.patterns, PeriodicGroup(each.every_ms)) for each in section.publish]
         self._is_periodic = [bool(each.every_ms) for each in section.publish]
         self._variables: Mapping[str, BridgeVariable] = {}
@@ -139,13 +139,13 @@ class JsonValues:
 
     def receive(
         self, topic: str, payload: bytes, now_ns: int, *, is_retained: bool
-    ) -> list[Command]:
+    ) -> list[WriteCommand]:
         """Return the command in a message; raise CommandError if it is refused."""
         del now_ns
         name = self._settable.get(topic)
         if name is None:
             raise CommandError(f"{topic}: no variable has this topic")
-        command = Command(name, None, topic)
+        command = WriteCommand(name, None, topic)
         if is_retained:
             reason = "a retained command is not executed: it would be again after each reconnection"
             raise CommandError(reason, command)
@@ -157,7 +157,7 @@ class JsonValues:
         except ValueError as exc:
             raise CommandError(str(exc), command) from None
 
-    def answer(self, command: Command, error: str, now_ns: int) -> Publish:
+    def answer(self, command: WriteCommand, error: str, now_ns: int) -> Publish:
         """Return the result of a command."""
         document: dict[str, Any] = {"ok": not error, "value": command.value}
         if error:

@@ -16,7 +16,7 @@ from eap.bridges.bridge import Bridge
 from eap.bridges.feed import BridgeFeed, Sample
 from eap.bridges.mqtt.json_values import JsonValues
 from eap.bridges.mqtt.sparkplug_node import SparkplugNode
-from eap.bridges.mqtt.topics import Command, CommandError, MessageCore, level
+from eap.bridges.mqtt.topics import CommandError, MessageCore, WriteCommand, level
 from eap.bridges.process import run_bridge
 from eap.config.mqtt_sections import MqttBridgeSpec
 from eap.errors import EapError
@@ -128,7 +128,7 @@ class BrokerConnection:
         self._feed = feed
         self._report = report
         self._has_news = asyncio.Event()
-        self._commands: asyncio.Queue[Command] = asyncio.Queue(_MAX_COMMANDS)
+        self._commands: asyncio.Queue[WriteCommand] = asyncio.Queue(_MAX_COMMANDS)
         self._warned_at_s = float("-inf")
         handlers = Handlers(
             self._connected, self._lost, self._receive, self._overrun, self._drained
@@ -218,7 +218,7 @@ class BrokerConnection:
                 self._warn(f"{command.name}: {error}")
             self._answer(command, error)
 
-    def _answer(self, command: Command, error: str) -> None:
+    def _answer(self, command: WriteCommand, error: str) -> None:
         if (message := self._core.answer(command, error, time_ns())) is not None:
             self._link.send(message)
 

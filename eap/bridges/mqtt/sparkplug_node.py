@@ -14,11 +14,11 @@ from eap.bridges.feed import BridgeVariable, Quality, Sample
 from eap.bridges.mqtt.sparkplug_types import TemplateTypes, metric_type, plain_value
 from eap.bridges.mqtt.topics import (
     MAX_PAYLOAD,
-    Command,
     CommandError,
     Outgoing,
     PeriodicGroup,
     WaitingValues,
+    WriteCommand,
     level,
 )
 from eap.codec import datatypes
@@ -216,7 +216,7 @@ class SparkplugNode:
 
     def receive(
         self, topic: str, payload: bytes, now_ns: int, *, is_retained: bool
-    ) -> list[Command]:
+    ) -> list[WriteCommand]:
         """Return the commands in a message; raise CommandError if it is refused."""
         del now_ns
         if is_retained:
@@ -238,11 +238,11 @@ class SparkplugNode:
             raise CommandError(f"{topic}: unknown station {station!r}")
         return [self._command(topic, device, each) for each in metrics]
 
-    def answer(self, command: Command, error: str, now_ns: int) -> None:
+    def answer(self, command: WriteCommand, error: str, now_ns: int) -> None:
         """Return None: hosts see the new value, or that it did not change."""
         del command, error, now_ns
 
-    def _command(self, topic: str, station: str, metric: Metric) -> Command:
+    def _command(self, topic: str, station: str, metric: Metric) -> WriteCommand:
         name = f"{station}/{metric.name}"
         if not metric.name and metric.alias is not None:
             name = self._by_alias.get(metric.alias, "")
@@ -250,7 +250,7 @@ class SparkplugNode:
         if variable is None or variable.station != station or name not in self._kinds:
             which = repr(metric.name) if metric.name else f"with alias {metric.alias}"
             raise CommandError(f"{topic}: unknown metric {which}")
-        command = Command(name, None, topic)
+        command = WriteCommand(name, None, topic)
         if name not in self._commanded:
             raise CommandError(f"{name}: commands do not name it, or it cannot be set", command)
         present = self._samples.get(name)

@@ -16,7 +16,7 @@ MAX_PAYLOAD = 65_536
 _FORBIDDEN = re.compile(r"[/+#\x00-\x1f]")
 
 
-class Command(NamedTuple):
+class WriteCommand(NamedTuple):
     """Value that a client wants to be written.
 
     Attributes:
@@ -66,10 +66,10 @@ class MessageCore(Protocol):
 
     def receive(
         self, topic: str, payload: bytes, now_ns: int, *, is_retained: bool
-    ) -> list[Command]:
+    ) -> list[WriteCommand]:
         """Return the commands in a message; raise CommandError if it is refused."""
 
-    def answer(self, command: Command, error: str, now_ns: int) -> Publish | None:
+    def answer(self, command: WriteCommand, error: str, now_ns: int) -> Publish | None:
         """Return the answer to a command, None where clients get none; *error* is empty if done."""
 
 
@@ -80,7 +80,7 @@ class CommandError(EapError):
         command: What could be read of it, for the answer; None if it is of no variable.
     """
 
-    def __init__(self, message: str, command: Command | None = None) -> None:
+    def __init__(self, message: str, command: WriteCommand | None = None) -> None:
         super().__init__(message)
         self.command = command
 

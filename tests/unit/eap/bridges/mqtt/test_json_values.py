@@ -10,7 +10,7 @@ import pytest
 from eap.ams.mqtt.network import Publish, Subscribe
 from eap.bridges.feed import BridgeVariable, Quality, Sample
 from eap.bridges.mqtt.json_values import JsonValues
-from eap.bridges.mqtt.topics import Command, CommandError
+from eap.bridges.mqtt.topics import CommandError, WriteCommand
 from eap.config.mqtt_sections import MqttPublish, MqttSection
 
 AT_NS = 1_700_000_000_123_400_000
@@ -147,7 +147,7 @@ def test_names_become_single_levels_of_topics():
 def test_command_is_json_with_or_without_an_id(name, payload, value, reference):
     topic = f"cell/mixer/{name}/set"
     found = make().receive(topic, payload, AT_NS, is_retained=False)
-    assert found == [Command(f"mixer/{name}", value, topic, reference)]
+    assert found == [WriteCommand(f"mixer/{name}", value, topic, reference)]
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_invalid_command_is_refused_with_the_reason(topic, payload, is_retained,
 
 
 def test_result_of_a_command_has_its_id():
-    core, command = make(), Command("mixer/setpoint", 55, "cell/mixer/setpoint/set", "a7")
+    core, command = make(), WriteCommand("mixer/setpoint", 55, "cell/mixer/setpoint/set", "a7")
     answer = core.answer(command, "", AT_NS)
     assert answer.topic == "cell/mixer/setpoint/result"
     assert not answer.is_retained
