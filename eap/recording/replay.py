@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, NamedTuple
 
 from eap.codec.pd import (
@@ -21,6 +20,7 @@ from eap.codec.pd import (
 )
 from eap.errors import ConfigError
 from eap.ids import NetId
+from eap.patterns import compile_patterns
 from eap.recording.frames_reader import FramesFile
 from eap.recording.messages import Leaf, write_leaf
 from eap.recording.published import RecordedFrame, RecordedPd
@@ -103,8 +103,9 @@ def frames_of(
         if isinstance(recording, FramesFile)
         else _made(recording, left_out)
     )
+    fits = compile_patterns([only or "*"])
     for frame in source:
-        if not only or any(fnmatchcase(name, only) for name in _names(frame)):
+        if any(map(fits, _names(frame))):
             yield frame
 
 

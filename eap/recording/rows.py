@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -10,6 +9,7 @@ from eap.codec.basetypes import Boolean, DataType
 from eap.codec.enumerations import Enumeration
 from eap.codec.times import Timed
 from eap.errors import ConfigError
+from eap.patterns import compile_patterns, is_pattern
 from eap.recording.messages import StationMessages
 from eap.suggest import nearest_in_any_case
 
@@ -141,9 +141,7 @@ def _hint(name: str, known: list[str]) -> str:
 
 def _matcher(pattern: str) -> Callable[[ValueColumn], bool]:
     parts = (f"{pattern}.", f"{pattern}[")
-    # Not fnmatch: brackets are indexes.
-    text = re.escape(pattern).replace(r"\*", ".*").replace(r"\?", ".")
-    wild = re.compile(text).fullmatch if "*" in pattern or "?" in pattern else None
+    wild = compile_patterns([pattern]) if is_pattern(pattern) else None
 
     def matches(column: ValueColumn) -> bool:
         names = [column.name, column.variable]
