@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-import signal
 from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
@@ -21,8 +20,9 @@ from eap.live.transport import UnixConnection
 from eap.runtime.bridges import BridgeFile
 from eap.runtime.folder import ApplianceFolder
 from eap.runtime.handover import BridgeHandover
+from eap.runtime.lifetime import wait_for_end
 from eap.runtime.log import LevelFile, start_logging
-from eap.runtime.startup import LIFE_PERIOD_S, Startup
+from eap.runtime.startup import Startup
 
 SectionT = TypeVar("SectionT", bound=msgspec.Struct)
 
@@ -86,9 +86,6 @@ async def _run(
     bridge: Bridge, work: Awaitable[None], beat: Callable[[], None], parent: int
 ) -> None:
     ended = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ended.set)
 
     async def serve() -> None:
         try:
@@ -98,13 +95,6 @@ async def _run(
 
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(each) for each in (bridge.report(), serve())]
-        while not ended.is_set() and os.getppid() == parent:
-            if bridge.is_ready:
-                beat()
-            try:
-                async with asyncio.timeout(LIFE_PERIOD_S):
-                    await ended.wait()
-            except TimeoutError:
-                continue
+        await wait_for_end(ended, parent, lambda: beat() if bridge.is_ready else None)
         for task in tasks:
             task.cancel()

@@ -9,7 +9,6 @@ import asyncio
 import logging
 import os
 import secrets
-import signal
 import socket
 import ssl
 from collections.abc import Callable, Mapping
@@ -24,8 +23,9 @@ from eap.live.client import LiveClient
 from eap.live.view import LiveView
 from eap.runtime.durable import whole_file
 from eap.runtime.handover import WebHandover
+from eap.runtime.lifetime import wait_for_end
 from eap.runtime.log import LevelFile, start_logging
-from eap.runtime.startup import LIFE_PERIOD_S, Startup
+from eap.runtime.startup import Startup
 from eap.runtime.store import plant_folder
 from eap.web.metrics import PATH, MetricsServer
 from eap.web.server import PageServer, open_listener, serving, tls_context
@@ -111,22 +111,12 @@ async def _serve(
     remote: Mapping[str, LiveClient],
     parent: int,
 ) -> None:
-    ended = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ended.set)
     async with (
         LiveView(plant, remote) as view,
         serving(_application(section, plant, view), listener, context),
     ):
         ready()
-        while not ended.is_set() and (not parent or os.getppid() == parent):
-            beat()
-            try:
-                async with asyncio.timeout(LIFE_PERIOD_S):
-                    await ended.wait()
-            except TimeoutError:
-                continue
+        await wait_for_end(asyncio.Event(), parent, beat)
 
 
 def _application(
