@@ -11,8 +11,8 @@ from time import time
 from typing import Any, NamedTuple
 
 from eap.bridges.bridge import Bridge
-from eap.bridges.field.link import FieldConversation, FieldLink, FieldLinkError, ResultT
 from eap.bridges.field.plan import PointKey, ReadPlan, ReadSpan, batches, bytes_in
+from eap.bridges.field.protocol import FieldConversation, FieldLink, FieldLinkError, ResultT
 from eap.codec.datatypes import with_nan
 from eap.codec.fieldaddresses import FieldPoint
 from eap.config.field_sections import ControllerSection

@@ -12,11 +12,10 @@ from typing import Literal, TypeVar
 from eap.bridges.bridge import Bridge
 from eap.bridges.feed import Sample
 from eap.bridges.field.client import ControllerPoints, FieldClient
-from eap.bridges.field.link import FieldLink
 from eap.bridges.field.memory import ServedMemory
 from eap.bridges.field.plan import PointKey
+from eap.bridges.field.protocol import FieldLink, FieldSession
 from eap.bridges.field.server import FieldServing
-from eap.bridges.field.session import FieldSession
 from eap.codec import datatypes
 from eap.codec.fieldaddresses import FieldPoint
 from eap.config.field import address_point

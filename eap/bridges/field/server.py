@@ -14,7 +14,7 @@ from typing import Any, Literal
 from eap.bridges.bridge import Bridge
 from eap.bridges.feed import Sample
 from eap.bridges.field.memory import ServedMemory, ServedPoint
-from eap.bridges.field.session import FieldSession
+from eap.bridges.field.protocol import FieldSession
 from eap.config.field import served_point
 from eap.config.field_sections import FieldServer
 from eap.config.web import parse_listen

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from eap.bridges.field.link import FieldConversation, FieldLinkError
 from eap.bridges.field.plan import ReadSpan, SpanLimits, pieces
+from eap.bridges.field.protocol import FieldConversation, FieldLinkError
 from eap.codec.fieldaddresses import FieldPoint
 from eap.codec.modbus import (
     MAX_BITS,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eap.bridges.field.memory import Denial, DeniedError, ServedMemory
-from eap.bridges.field.session import FieldAnswer
+from eap.bridges.field.protocol import FieldAnswer
 from eap.codec.fieldaddresses import S7_AREAS
 from eap.codec.s7 import (
     HEADER_SIZE,

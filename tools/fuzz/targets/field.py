@@ -7,10 +7,9 @@ from contextlib import suppress
 from itertools import cycle
 from typing import Any
 
-from eap.bridges.field.link import FieldLink, FieldLinkError
 from eap.bridges.field.memory import ServedMemory, ServedPoint
 from eap.bridges.field.plan import ReadSpan
-from eap.bridges.field.session import FieldSession
+from eap.bridges.field.protocol import FieldLink, FieldLinkError, FieldSession
 from eap.bridges.modbus.link import ModbusLink
 from eap.bridges.modbus.session import ModbusSession
 from eap.bridges.s7.link import S7Link

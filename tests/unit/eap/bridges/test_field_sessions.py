@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.bridges.field.link import FieldLink, FieldLinkError
 from eap.bridges.field.memory import ServedMemory, ServedPoint
 from eap.bridges.field.plan import PointKey, ReadPlan, ReadSpan, batches, bytes_in
-from eap.bridges.field.session import FieldSession
+from eap.bridges.field.protocol import FieldLink, FieldLinkError, FieldSession
 from eap.bridges.modbus.link import ModbusLink
 from eap.bridges.modbus.session import ModbusSession
 from eap.bridges.s7.link import S7Link
