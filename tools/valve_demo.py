@@ -71,7 +71,7 @@ OUTPUT, FEEDBACK, LAMP = CHAIN[1:]
 
 
 class DemoError(Exception):
-    """Something did not happen that should have; the message says what."""
+    """An expected event did not happen; the message names it."""
 
 
 class Plant:

@@ -34,7 +34,7 @@ from eap.pd.spec import Authentication, PortKind
 
 
 class Exposure(msgspec.Struct, frozen=True):
-    """Something that is open, and how it is closed; *requirement* is that of IEC 62443-4-2."""
+    """Place that is open to other hosts, and its remedy; *requirement* is of IEC 62443-4-2."""
 
     file: str
     line: int

@@ -42,7 +42,7 @@ class ErrorCode(StrEnum):
     VALUE = auto()
     """Not a value of the variable's type, or not a command of a simulated bus."""
     REFUSED = auto()
-    """Somebody else writes this variable, or this bus does not allow it."""
+    """Not a variable that clients write, or access rules or this bus do not allow it."""
     BUSY = auto()
     """A limit is reached: clients, subscriptions, conversations, or the length of an answer."""
     UNAVAILABLE = auto()

@@ -68,7 +68,7 @@ class EventKind(StrEnum):
 
 
 class RecordingEvent(Struct, frozen=True, kw_only=True):
-    """Something that happened while recording; *count* is the number of lost cycles or frames."""
+    """Event while recording; *count* is the number of lost cycles or frames."""
 
     time_ns: int
     kind: EventKind
