@@ -59,7 +59,7 @@ dist: setup  ## build wheel and archive of sources in dist/
 deb: dist  ## build the Debian package in dist/, for the Python of this Debian
 	@$(BIN)/python -m tools.package.deb dist/*.whl dist
 
-test-package: deb  ## test wheel and Debian package (as root: in a clean Debian, made by debootstrap)
+test-package: deb  ## test wheel, Debian package and image (as root: in a clean Debian, made by debootstrap)
 	@sh tools/install_peers.sh package || echo 'make test-package: going on; what needs them is skipped and listed'
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --group deploy || echo 'make test-package: going on without Ansible'
 	@$(BIN)/python -m pytest tests/package $(ARGS)

@@ -7,7 +7,7 @@ here=$(dirname "$0")
 case ${1:-} in
     # command=package
     test) wanted="tshark=tshark ip=iproute2 setpriv=util-linux mosquitto=mosquitto mosquitto_sub=mosquitto-clients openssl=openssl prometheus=prometheus pg_ctlcluster=postgresql chromium-headless-shell=chromium-headless-shell tmux=tmux" ;;
-    package) wanted="debootstrap=debootstrap ssh=openssh-client unshare=util-linux pipx=pipx" ;;
+    package) wanted="debootstrap=debootstrap buildah=buildah ssh=openssh-client unshare=util-linux pipx=pipx" ;;
     bench) wanted="cyclictest=rt-tests ip=iproute2 taskset=util-linux" ;;
     *)
         echo "usage: $0 test|package|bench" >&2
