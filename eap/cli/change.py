@@ -66,6 +66,9 @@ def running_plant(
     with link_to_hosts(load_or_raise(file), file, local=local) as (link, plant, notes):
         for note in notes:
             click.echo(note, err=True)
+        for name, keys in link.sections_to_restart(plant).items():
+            note = f"{name}: {', '.join(keys)}: not as in the file: restart the appliance"
+            click.echo(note, err=True)
         yield link, choose(plant, link, wanted)
 
 

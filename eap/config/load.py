@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
+from hashlib import blake2b
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
@@ -89,7 +90,7 @@ from eap.config.users import PlantUserSection
 from eap.config.variables import check_variables
 from eap.config.web import check_web, resolved, resolved_tls, warn_of_pictures
 from eap.config.web_sections import MetricsSection, WebSection
-from eap.ids import Destination, InterfaceUri, MacAddr, NetId
+from eap.ids import Destination, InterfaceUri, MacAddr, NetId, encode_value
 from eap.pd.address import address_text, net_id_of, source_octets
 from eap.pd.spec import (
     REQUESTER,
@@ -524,6 +525,20 @@ class Plant(msgspec.Struct, frozen=True):
     """Recordings that run beside the plant, with resolved paths."""
     bridges: Mapping[str, msgspec.Struct] = {}
     """Sections of the bridges, by their keys, with resolved paths."""
+
+    def section_digests(self) -> dict[str, str]:
+        """Return a digest of each section for an optional process, by its key.
+
+        These begin with the appliance: another digest is another section than the one that runs.
+        """
+        sections: dict[str, object] = {"web": self.web, "metrics": self.metrics, **self.bridges}
+        sections["record"] = self.record or None
+        encoded = {
+            key: msgspec.json.encode(each, enc_hook=encode_value)
+            for key, each in sections.items()
+            if each is not None
+        }
+        return {key: blake2b(each, digest_size=8).hexdigest() for key, each in encoded.items()}
 
     def on_host(self, host: HostSection) -> Plant:
         """Return the part of the plant that *host* runs: its stations, and the servers it has."""

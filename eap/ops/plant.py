@@ -244,6 +244,27 @@ class PlantLink:
             name: client.info.host for name, client in self._clients.items() if client.info.host
         }
 
+    def sections_to_restart(self, plant: Plant) -> dict[str, list[str]]:
+        """Return the keys of *plant* that the appliances here run otherwise, by their plants.
+
+        They are for optional processes, which only begin with the appliance.
+        """
+        hosts = {each.name: each for each in plant.hosts}
+        found: dict[str, list[str]] = {}
+        for name, client in self._clients.items():
+            info = client.info
+            if name in self._remote or info.sections is None or not info.plant_file:
+                continue
+            own = plant.on_host(hosts[info.host]) if info.host in hosts else plant
+            wanted = own.section_digests()
+            if keys := [
+                key
+                for key in dict.fromkeys((*wanted, *info.sections))
+                if wanted.get(key) != info.sections.get(key)
+            ]:
+                found[info.plant] = keys
+        return found
+
     def reached(self) -> PlantLink:
         """Return the link to the stations that answer now; the hosts of the others are away."""
         found: dict[str, ApplianceClient] = {}

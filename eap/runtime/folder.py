@@ -70,6 +70,8 @@ class ApplianceInfo(msgspec.Struct):
     """True if changes that cannot be recorded fail."""
     host: str = ""
     """Host of the plant that this computer is; empty without ``hosts``."""
+    sections: dict[str, str] | None = None
+    """Digests of the plant file's sections for optional processes; None from older releases."""
 
 
 def runtime_root() -> Path:

@@ -178,6 +178,7 @@ class Supervisor:
         self._clock = clock
         self._info = info
         info.audit_required = plant.audit_required
+        info.sections = plant.section_digests()
         self._folder = folder
         self._bytecode = str(folder.bytecode)
         self._engine = Child("engine", "eap.engine.process", self._bytecode)

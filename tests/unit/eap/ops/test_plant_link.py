@@ -9,6 +9,8 @@ import pytest
 from msgspec.structs import replace
 
 from eap.config.load import Plant
+from eap.config.mqtt_sections import MqttSection
+from eap.config.web_sections import MetricsSection, WebSection
 from eap.errors import ControlError
 from eap.ops.plant import StationPlan, link_to
 from tests.support.fakeappliance import station
@@ -80,3 +82,17 @@ def test_anything_is_a_difference(field):
     none = {"changes": [], "notes": [], "refused": []}
     assert not StationPlan("mixer", **none).differs
     assert StationPlan("mixer", **none | {field: ["x"]}).differs
+
+
+def test_sections_that_an_appliance_runs_otherwise_are_named(stack):
+    PlantStub("line", PLANT.stations, stack)
+    before = replace(PLANT, web=WebSection(), bridges={"mqtt": MqttSection(broker="mqtt://b")})
+    after = replace(
+        PLANT, bridges={"mqtt": MqttSection(broker="mqtt://c")}, metrics=MetricsSection()
+    )
+    with link_to(PLANT, FILE) as link:
+        assert link.sections_to_restart(after) == {}, "an older release does not say what it runs"
+        for each in link._clients.values():
+            each.info.sections = before.section_digests()
+        assert link.sections_to_restart(before) == {}
+        assert link.sections_to_restart(after) == {"line": ["metrics", "mqtt", "web"]}
