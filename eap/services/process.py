@@ -286,7 +286,7 @@ class Services:
         self._startup.step("opening gateways and sockets")
         audit = self._audit(devices.routers)
         buses = self._bus_table(link, supervisor, devices, audit)
-        logins = LoginLog(audit)
+        logins = LoginLog(self._handover.plant, audit)
         route_logins = RouteLogins(self._handover.users)
         network = Network(
             sockets,

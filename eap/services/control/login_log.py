@@ -24,11 +24,13 @@ class LoginLog:
     """Refused logins, by transport.
 
     Args:
+        plant: Its name, for findings.
         audit: Gets a line for each user and host.
         now: Unix time in seconds.
     """
 
-    def __init__(self, audit: Audit, *, now: Callable[[], float] = time) -> None:
+    def __init__(self, plant: str, audit: Audit, *, now: Callable[[], float] = time) -> None:
+        self._plant = plant
         self._audit = audit
         self._now = now
         self._counts: dict[str, dict[LoginFailure, int]] = {}
@@ -71,7 +73,7 @@ class LoginLog:
             found.append(
                 {
                     "severity": "warning",
-                    "where": transport,
+                    "where": f"{self._plant} {transport}",
                     "what": f"{total} logins refused, {locked} of them locked out; last {last}",
                     "advice": "the audit has users and hosts",
                     "since": at_s,
