@@ -353,6 +353,7 @@ def _read(file: Path) -> str:
     epilog=examples(
         "eapctl routes add-remote island-01 192.168.1.5 --user Administrator",
         "eapctl routes add-remote island-01 192.168.1.5 --user Administrator --password-file pw",
+        "eapctl routes add-remote island-01 192.168.1.5 --user Administrator --fingerprint 5f:a4:…",
     ),
 )
 @click.argument("station", shell_complete=complete_station)
@@ -376,6 +377,14 @@ def _read(file: Path) -> str:
     metavar="MS",
     help="Timeout of the answer.",
 )
+@click.option("--tls", is_flag=True, help="By Secure ADS (TCP 8016), with STATION's certificate.")
+@click.option(
+    "--fingerprint",
+    default="",
+    metavar="HEX",
+    help="SHA-256 of the other router's certificate (--tls); else an authority of STATION signed"
+    " it.",
+)
 @plant_option
 @json_option("Print one object: ok, result, text.")
 @click.pass_context
@@ -387,13 +396,16 @@ def add_remote(
     user: str,
     password_file: Path | None,
     wait_ms: int,
+    tls: bool,
+    fingerprint: str,
     plant: str | None,
     output: Renderer,
 ) -> None:
     """Request the router at ADDRESS, such as that of a PLC, to add a route to STATION.
 
     Most routers answer only hosts that they have a route to.  The request goes to UDP 48899, with
-    user and password in clear.
+    user and password in clear.  With --tls it is encrypted, and the other router trusts the
+    certificate of STATION from then on.
 
     Exits with 1 when the other router refuses, or does not answer.
     """
@@ -411,6 +423,8 @@ def add_remote(
             user=user,
             password=password,
             wait_ms=wait_ms,
+            tls=tls or bool(fingerprint),
+            fingerprint=fingerprint,
         )
     output.show(answer, lambda each: f"{address}: {each.text}")
     if not answer.ok:

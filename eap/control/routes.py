@@ -122,7 +122,9 @@ class RoutesScanParameters(Parameters, frozen=True, kw_only=True):
 class RoutesAddRemoteParameters(Parameters, frozen=True, kw_only=True):
     """``routes_add_remote``: requests a route to *station* at the router of *address*.
 
-    User and password are those of the other system; they are sent in clear text.
+    User and password are those of the other system.  By UDP 48899 they are sent in clear text, with
+    *tls* by Secure ADS, to a router whose certificate has *fingerprint*, or is signed by an
+    authority of the station.
     """
 
     station: str
@@ -131,6 +133,8 @@ class RoutesAddRemoteParameters(Parameters, frozen=True, kw_only=True):
     user: Text = ""
     password: Text = ""
     wait_ms: Annotated[int, Meta(ge=10, le=60_000)] = 5_000
+    tls: bool = False
+    fingerprint: Text = ""
 
 
 class EndpointRow(Document, frozen=True, kw_only=True):

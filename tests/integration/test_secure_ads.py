@@ -14,7 +14,7 @@ from typing import Self
 import pytest
 
 from tests.support import aoe
-from tests.support.appliance import Appliance, Plants, wait_until
+from tests.support.appliance import Appliance, Plants, run_eapctl, wait_until
 
 pytestmark = pytest.mark.net
 
@@ -145,6 +145,21 @@ def test_rule_names_the_client_of_a_certificate(plant: Appliance, folder: Path) 
     lines = [json.loads(line) for line in audit.read_text().splitlines()]
     told = [(each["transport"], each["allowed"]) for each in lines if "tls" in each["transport"]]
     assert told == [("ams-tls:panel", True), ("ams-tls:mill", False)]
+
+
+def test_station_requests_a_route_from_the_other_router(plant: Appliance, folder: Path) -> None:
+    """The plant file has the route already: the answer is the same."""
+    words = ["routes", "add-remote", "mill", SAW[0], "--user", "engineer"]
+    password = ["--password-file", str(folder / "engineer.secret")]
+    right = ["--fingerprint", fingerprint(folder, "saw")]
+    assert "added" in plant.command(*words, *password, *right)
+    wrong = run_eapctl(
+        plant.runtime, *words, *password, "--fingerprint", fingerprint(folder, "mill")
+    )
+    assert wrong.returncode == 1
+    assert "its certificate has the fingerprint" in wrong.stdout
+    without = run_eapctl(plant.runtime, *words, *password, "--tls")
+    assert "station mill needs a fingerprint, or secure_ads with a ca" in without.stderr
 
 
 def test_client_requests_a_route_and_is_known_until_it_is_removed(

@@ -217,6 +217,8 @@ class RouteMethods:
         # Texts of the UDP service end with a NUL: one inside would truncate them silently.
         if "\0" in name + wanted.user + wanted.password:
             raise ControlError("NUL in name, user or password", code=ErrorCode.VALUE)
+        if wanted.tls:
+            return await _add_remote_by_tls(view, wanted, name)
         route = RemoteRouteRequest(name, view.router.net_id, wanted.user, wanted.password)
         with unless_unavailable():
             result = await add_remote_route(
@@ -390,6 +392,33 @@ class RouteMethods:
 
     def _view(self, station: str) -> RouterView:
         return of_station(station, self._views)
+
+
+async def _add_remote_by_tls(
+    view: RouterView, wanted: records.RoutesAddRemoteParameters, name: str
+) -> records.RemoteRouteResult:
+    """Request a route by Secure ADS."""
+    # Imported here: few plants have it.
+    from eap.services.transports.secure_ads import SecureOpenError, request_route
+
+    own = view.routes.spec.secure
+    if own is None or not (wanted.fingerprint or own.ca):
+        missing = "a fingerprint, or secure_ads with a ca" if own else "secure_ads"
+        raise ControlError(f"station {wanted.station} needs {missing}", code=ErrorCode.VALUE)
+    try:
+        fingerprint = parse_fingerprint(wanted.fingerprint) if wanted.fingerprint else ""
+    except ValueError as exc:
+        raise ControlError(str(exc), code=ErrorCode.VALUE) from None
+    spec = SecureRouteSpec(fingerprint=fingerprint).complete(own)
+    login = wanted.user, wanted.password
+    try:
+        async with asyncio.timeout(wanted.wait_ms / 1000):
+            await request_route(spec, wanted.address, (view.router.net_id, name), login)
+    except TimeoutError:
+        return records.RemoteRouteResult(ok=False, result=None, text="no answer by TCP 8016")
+    except SecureOpenError as exc:
+        return records.RemoteRouteResult(ok=False, result=None, text=str(exc))
+    return records.RemoteRouteResult(ok=True, result=0, text="added")
 
 
 def _kept_note(route: StaticRoute) -> str:

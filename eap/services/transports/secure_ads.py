@@ -15,21 +15,24 @@ from typing import ClassVar, NamedTuple
 from eap.ams.reassembly import BareAmsDecoder
 from eap.ams.spec import SecureRouteSpec
 from eap.codec.secureads import (
+    AMS_TLS_PORT,
     VERSION,
     ConnectError,
     ConnectFlag,
     ConnectInfo,
     decode_connect_info,
+    encode_ansi,
     length_of,
 )
 from eap.codec.tlshandshake import fingerprint_of
 from eap.errors import CodecError, EnvironmentalError
 from eap.ids import NetId
+from eap.net.reconnecting import connect_tcp
 from eap.net.tls import client_context, distrust_of, words_of
 from eap.runtime.drop_counters import DropReason
 from eap.services.routing.station_router import StationRouter
 from eap.services.transports.ams_connection import AmsConnection, PacketHandler
-from eap.services.transports.ams_tcp import AmsUplink, PeerAddress, UplinkArguments
+from eap.services.transports.ams_tcp import CONNECT_S, AmsUplink, PeerAddress, UplinkArguments
 
 HANDSHAKE_S = 8.0
 """Time limit of TLS and of the messages behind it."""
@@ -247,6 +250,38 @@ def hello_of(net_id: NetId, spec: SecureRouteSpec) -> ConnectInfo:
     is_pinned = spec.psk is None and bool(spec.fingerprint)
     flags = ConnectFlag.SELF_SIGNED if is_pinned else 0
     return ConnectInfo(net_id, flags, socket.gethostname())
+
+
+async def request_route(
+    spec: SecureRouteSpec, address: str, own: tuple[NetId, str], login: tuple[str, str]
+) -> None:
+    """Request the router at *address* to add a route, and to trust the certificate of this end.
+
+    Args:
+        spec: Settings of the connection, complete.
+        address: IPv4 address of the other router.
+        own: NetID and name of the route, both of this end.
+        login: User and password of the other system.
+
+    Raises:
+        SecureOpenError: it cannot be reached, is not the right one, or refuses.
+    """
+    net_id, name = own
+    flags = ConnectFlag.ADD_REMOTE | ConnectFlag.IP_ADDRESS | ConnectFlag.IGNORE_NAME
+    if spec.fingerprint:
+        flags |= ConnectFlag.SELF_SIGNED
+    user, password = map(encode_ansi, login)
+    info = ConnectInfo(net_id, flags, name, user=user, password=password)
+    try:
+        sock = await connect_tcp(
+            address, AMS_TLS_PORT, None, timeout_s=CONNECT_S, unconfirmed_s=HANDSHAKE_S
+        )
+    except TimeoutError:
+        raise SecureOpenError(f"no answer by TCP {AMS_TLS_PORT}") from None
+    except OSError as exc:
+        raise SecureOpenError(f"TCP {AMS_TLS_PORT}: {exc.strerror or exc}") from None
+    opened = await open_secure(sock, spec, address, info)
+    opened.transport.abort()
 
 
 class AmsTlsUplink(AmsUplink):

@@ -257,11 +257,11 @@ class AmsTlsListener:
         if info.version != VERSION:
             text = f"version {info.version} of Secure ADS, expected {VERSION}"
             raise _RefusedError(ConnectError.VERSION, DropReason.TLS_VERSION, text)
+        if info.flags & ConnectFlag.ADD_REMOTE and peer.fingerprint:
+            return await self._add_route(connection, info, peer)
         known = self._settings.known()
         if (name := known.get(peer.fingerprint)) is not None:
             return name
-        if info.flags & ConnectFlag.ADD_REMOTE:
-            return await self._add_route(connection, info, peer)
         if not peer.is_trusted:
             text = f"unknown certificate of {peer.name or 'nobody'}: {peer.fingerprint}"
             raise _RefusedError(ConnectError.CERTIFICATE, DropReason.TLS_FINGERPRINT, text)
