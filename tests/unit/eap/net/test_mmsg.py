@@ -9,6 +9,7 @@ import time
 
 import pytest
 
+from eap.compiled import cyclic
 from eap.net import mmsg
 from eap.net.mmsg import (
     BATCH,
@@ -287,3 +288,80 @@ def _is_empty(sock):
     except BlockingIOError:
         return True
     return False
+
+
+needs_compiled = pytest.mark.skipif(cyclic is None, reason="needs the compiled part: make setup")
+
+
+def drain(batch, sock, handler):
+    return batch.compiled().drain(sock.fileno(), [handler], None, "origin", lambda number: False)
+
+
+@needs_compiled
+def test_compiled_receiver_hands_over_what_the_python_code_does(pair):
+    sender, receiver = pair
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    frames = frames_to(receiver, 3)
+    got = []
+
+    def handle(view, size, at_ns, origin):
+        got.append((bytes(view[:size]), at_ns, batch.sender(view), origin))
+
+    for stamped in (1, 0, 1, 1):
+        receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, stamped)
+        for count in (1, 3):
+            before = time.monotonic_ns()
+            out.send(frames[:count])
+            assert drain(batch, receiver, handle) == count
+            after = time.monotonic_ns()
+            assert [each[0] for each in got] == [bytes(frame.buffer) for frame in frames[:count]]
+            # Two clocks are read one after the other: allow for a stall between the readings.
+            assert all(before - 5_000_000 < each[1] <= after for each in got)
+            host, port = sender.getsockname()
+            assert {each[2:] for each in got} == {((port, socket.inet_aton(host)), "origin")}
+            got.clear()
+    assert drain(batch, receiver, handle) == 0
+
+
+@needs_compiled
+def test_compiled_receiver_raises_what_a_handler_raises_and_goes_on(pair):
+    sender, receiver = pair
+    out, batch = SendBatch(sender, _socket_address), ReceiveBatch()
+    frames = frames_to(receiver, 2)
+
+    def fail(*_):
+        raise KeyError("handler")
+
+    def again(*_):
+        drain(batch, receiver, fail)
+
+    for wrong, error in ((fail, KeyError), (again, RuntimeError)):
+        out.send(frames)
+        with pytest.raises(error):
+            drain(batch, receiver, wrong)
+    out.send(frames)
+    assert drain(batch, receiver, lambda *_: None) == 2
+
+
+@needs_compiled
+def test_compiled_receiver_refuses_memory_that_does_not_fit():
+    batch = ReceiveBatch()
+    parts = [batch._headers, batch.octets, batch._control, batch._senders, 32, 0, batch.views]
+    cyclic.Receiver(*parts)
+    for index, wrong in (
+        (0, bytearray(64 * BATCH)),
+        (0, batch._headers[:-1]),
+        (1, batch.octets[64:]),
+        (1, memoryview(bytearray(batch.octets))),
+        (2, bytearray(7)),
+        (3, bytearray(7)),
+        (3, None),
+        (4, 24),
+        (5, -1),
+        (5, 1 << 20),
+        (6, batch.views[1:]),
+    ):
+        with pytest.raises(ValueError, match="batch"):
+            cyclic.Receiver(*parts[:index], wrong, *parts[index + 1 :])
+    with pytest.raises(TypeError):
+        batch.compiled().drain(0, {}, int, None, int)
