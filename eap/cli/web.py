@@ -71,7 +71,7 @@ def _read(plant: Path | None, listen: str | None) -> tuple[str, WebSection]:
     from msgspec.structs import replace
 
     from eap.ams.spec import Role
-    from eap.config.web import parse_listen
+    from eap.config.listen import parse_listen
     from eap.config.web_sections import WebSection
 
     name, section = "", WebSection()

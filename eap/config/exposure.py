@@ -18,6 +18,7 @@ from eap.config.brokers import brokers_of, parse_url
 from eap.config.field_sections import FieldServerSection, ModbusSection, S7Section
 from eap.config.finding import FindingReport
 from eap.config.index import Index
+from eap.config.listen import parse_listen
 from eap.config.mqtt_sections import MqttSection
 from eap.config.opcua_sections import ChannelSecurity, ClientTrust
 from eap.config.structs import (
@@ -28,7 +29,6 @@ from eap.config.structs import (
     RouteSection,
     StationSection,
 )
-from eap.config.web import parse_listen
 from eap.ids import InterfaceUri
 from eap.pd.spec import Authentication, PortKind
 

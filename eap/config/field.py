@@ -43,11 +43,11 @@ from eap.config.field_sections import (
 )
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
+from eap.config.listen import parse_listen
 from eap.config.ports import check_names
 from eap.config.selection import VariableNames, match_names, reason_not_settable
 from eap.config.structs import StationSection
 from eap.config.variables import named_part
-from eap.config.web import parse_listen
 from eap.ids import parse_host
 from eap.pd.spec import FieldSource, S7Source, S7Target, Source, Target
 from eap.suggest import suggest
@@ -236,13 +236,13 @@ class _Served:
 
     def check_s7(self, server: S7ServerSection) -> None:
         """Report what of data blocks cannot be served."""
-        self._check_server(server, server.listen)
+        self._check_server(server)
         for area in self._blocks(server):
             list(self.items(area))
 
     def check_modbus(self, server: ModbusServerSection) -> None:
         """Report what of registers cannot be served."""
-        self._check_server(server, server.listen)
+        self._check_server(server)
         for area in self._tables(server):
             list(self.items(area))
 
@@ -257,9 +257,9 @@ class _Served:
         words, octets = server.word_order is Order.LITTLE, server.byte_order is Order.LITTLE
         return FieldServer(server.listen, server.every_ms, items, server.unit, words, octets)
 
-    def _check_server(self, server: FieldServerSection, listen: str) -> None:
+    def _check_server(self, server: FieldServerSection) -> None:
         try:
-            parse_listen(listen)
+            parse_listen(server.listen)
         except ValueError as exc:
             self._report.add(f"{server.at}.listen", str(exc), _LISTEN)
 

@@ -11,11 +11,11 @@ from ipaddress import IPv4Address, IPv4Network
 
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index, is_local_only
+from eap.config.listen import parse_listen
 from eap.config.plant_sections import HostSection
 from eap.config.ports import check_names, resolve_destination
 from eap.config.servers import find_servers
 from eap.config.structs import PortSection, StationSection
-from eap.config.web import parse_listen
 from eap.errors import ConfigError
 from eap.ids import INTERFACE_NAME_SIZE, Destination, DestinationKind, InterfaceUri
 from eap.suggest import suggest

@@ -10,10 +10,10 @@ from eap.ams.spec import Role
 from eap.config.brokers import check_file
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index
+from eap.config.listen import parse_listen
 from eap.config.opcua_sections import ChannelSecurity, OpcUaSection
 from eap.config.selection import VariableNames, reason_not_settable
 from eap.config.users import check_users
-from eap.config.web import parse_listen
 
 _LISTEN = "ADDRESS:PORT, such as 127.0.0.1:4840 or [::1]:4840"
 
@@ -24,16 +24,6 @@ def channel_securities(opcua: OpcUaSection) -> tuple[ChannelSecurity, ...]:
         return opcua.security
     is_local = parse_listen(opcua.listen).is_loopback
     return tuple(each for each in ChannelSecurity if is_local or each is not ChannelSecurity.NONE)
-
-
-def role_of_anonymous(opcua: OpcUaSection) -> Role | None:
-    """Return the role of clients without a user; None if they have to log in.
-
-    Programs of this host may do everything by ADS, too, unless a rule denies it.
-    """
-    if opcua.anonymous is not None or opcua.users:
-        return opcua.anonymous
-    return Role.ENGINEER
 
 
 def resolved_opcua(opcua: OpcUaSection, folder: Path, operators: tuple[str, ...]) -> OpcUaSection:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from eap.config.finding import FindingReport
 from eap.config.index import Index
+from eap.config.listen import Listen, parse_listen
 from eap.config.plant_sections import PlantFile
-from eap.config.web import Listen, parse_listen
 
 
 class Server(NamedTuple):

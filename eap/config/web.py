@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from ipaddress import ip_address, ip_network
+from ipaddress import ip_network
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 from msgspec.structs import replace
 
@@ -15,6 +15,7 @@ from eap.codec import datatypes
 from eap.config.brokers import check_file
 from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
+from eap.config.listen import parse_listen
 from eap.config.pictures import read_picture
 from eap.config.selection import VariableNames, match_names, reason_not_settable
 from eap.config.structs import StationSection
@@ -56,40 +57,6 @@ _LISTEN = "ADDRESS:PORT, such as 127.0.0.1:8080 or [::1]:8080"
 _WINDOW = re.compile(r"(\d{1,6})(s|m|h)")
 _UNITS = {"s": 1, "m": 60, "h": 3600}
 _HEADER = re.compile(r"[A-Za-z0-9-]+")
-
-
-class Listen(NamedTuple):
-    """Address of a server."""
-
-    host: str
-    port: int
-
-    @property
-    def is_loopback(self) -> bool:
-        """True if only programs of this host reach it."""
-        return ip_address(self.host).is_loopback
-
-    @property
-    def is_any(self) -> bool:
-        """True for all addresses of this host."""
-        return ip_address(self.host).is_unspecified
-
-    def url(self, scheme: str) -> str:
-        """Return the address for a browser."""
-        host = "localhost" if self.is_any else self.host
-        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/"
-
-
-def parse_listen(text: str) -> Listen:
-    """Read ``ADDRESS:PORT``; raise ValueError if it is none."""
-    host, separator, number = text.rpartition(":")
-    if not separator or not number.isdecimal() or not 0 < int(number) < 65536:
-        raise ValueError(f"{text!r} is not an address with a port (1 to 65535)")
-    host = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-    try:
-        return Listen(str(ip_address(host)), int(number))
-    except ValueError:
-        raise ValueError(f"{host!r} is not an IP address") from None
 
 
 def window_s(text: str) -> int:
@@ -139,17 +106,6 @@ def default_pages(plant: str, stations: Iterable[str]) -> tuple[WebPage, ...]:
         for name in stations
     )
     return overview, *own
-
-
-def default_role(web: ServerSection) -> Role | None:
-    """Return the role of browsers without a user; None if they have to log in.
-
-    Programs of this host may do everything by ADS, too, unless a rule denies it.
-    """
-    if web.anonymous is not None:
-        return web.anonymous
-    has_users = web.users or web.proxy is not None
-    return None if has_users else Role.ENGINEER
 
 
 def resolved_tls(section: ServerT, folder: Path) -> ServerT:

@@ -26,7 +26,7 @@ from typing import Final, TypeAlias
 import msgspec
 from aiohttp import web
 
-from eap.config.web import default_role
+from eap.config.listen import role_of_anonymous
 from eap.config.web_sections import ServerSection
 from eap.control.logins import NOTE_LOGINS
 from eap.live.view import LiveView
@@ -97,7 +97,7 @@ class Guard:
         self.has_logins = any(user.password for user in section.users)
         self.is_secure = section.tls is not None
         self._users = {user.name: user for user in section.users}
-        role = default_role(section)
+        role = role_of_anonymous(section)
         self._anonymous = None if role is None else Principal("", role)
         self._hosts = {name.lower().rstrip(".") for name in ("localhost", *section.hosts)}
         self._hosts.add(os.uname().nodename.lower())

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from aiohttp import web
 
-from eap.config.web import parse_listen
+from eap.config.listen import parse_listen
 from eap.config.web_sections import MetricsSection, WebSection
 from eap.errors import EnvironmentalError
 from eap.live.client import LiveClient

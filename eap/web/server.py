@@ -14,7 +14,7 @@ from pathlib import Path
 
 from aiohttp import web
 
-from eap.config.web import parse_listen
+from eap.config.listen import parse_listen
 from eap.config.web_sections import ServerSection, WebSection
 from eap.errors import EnvironmentalError
 from eap.live.view import LiveReport, LiveView

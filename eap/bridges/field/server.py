@@ -17,7 +17,7 @@ from eap.bridges.field.memory import ServedMemory, ServedPoint
 from eap.bridges.field.protocol import FieldSession
 from eap.config.field import served_point
 from eap.config.field_sections import FieldServer
-from eap.config.web import parse_listen
+from eap.config.listen import parse_listen
 from eap.errors import CodecError, EapError, EnvironmentalError
 
 MAX_CLIENTS = 64

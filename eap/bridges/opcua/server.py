@@ -29,10 +29,10 @@ from eap.bridges.opcua.nodes import STATES, MethodNode, StationFacts, VariableNo
 from eap.bridges.opcua.sessions import Client, PlantListener, PlantServer, TrustingPolicy
 from eap.codec.ads import AdsError, AdsRange, IndexGroup, SdoOffset
 from eap.codec.ams import AmsCommand
-from eap.config.opcua import channel_securities, role_of_anonymous
+from eap.config.listen import Listen, parse_listen, role_of_anonymous
+from eap.config.opcua import channel_securities
 from eap.config.opcua_sections import ChannelSecurity, ClientTrust, OpcUaSection
 from eap.config.selection import match_names
-from eap.config.web import Listen, parse_listen
 from eap.control.device import REQUEST_STATE
 from eap.control.logins import NOTE_LOGINS
 from eap.control.protocol import ErrorCode, WriteOrigin

@@ -7,8 +7,9 @@ import pytest
 
 from eap.ams.spec import Role
 from eap.config.index import ExpectedBus
+from eap.config.listen import role_of_anonymous
 from eap.config.load import PlantResult, load
-from eap.config.opcua import channel_securities, role_of_anonymous
+from eap.config.opcua import channel_securities
 from eap.config.opcua_sections import ChannelSecurity, OpcUaSection
 from tests.support.webplant import HASH
 

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from eap.ams.spec import Role
 from eap.config.index import ExpectedBus
+from eap.config.listen import parse_listen, role_of_anonymous
 from eap.config.load import PlantResult, load
 from eap.config.selection import match_names
-from eap.config.web import default_role, parse_listen, window_s
+from eap.config.web import window_s
 from eap.config.web_sections import WebSection
 from tests.support.webplant import HASH
 
@@ -252,5 +253,5 @@ def test_pattern_fits_as_its_regular_expression(pattern, name):
 
 
 def test_role_without_login():
-    assert default_role(WebSection()) is Role.ENGINEER
-    assert default_role(WebSection(anonymous=Role.VIEWER)) is Role.VIEWER
+    assert role_of_anonymous(WebSection()) is Role.ENGINEER
+    assert role_of_anonymous(WebSection(anonymous=Role.VIEWER)) is Role.VIEWER
