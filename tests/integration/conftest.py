@@ -1,4 +1,7 @@
-"""Fixtures of the tests of running appliances."""
+"""Fixtures of the tests of running appliances.
+
+A module with ``IS_ABOUT_PROCESSES`` starts them as programs, others fork them.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +13,17 @@ from tests.support.appliance import Plants, plants
 
 
 @pytest.fixture
-def farm() -> Iterator[Plants]:
+def farm(request: pytest.FixtureRequest) -> Iterator[Plants]:
     """Runs appliances and ends them."""
     with plants() as folder:
+        folder.is_real = hasattr(request.module, "IS_ABOUT_PROCESSES")
         yield folder
 
 
 @pytest.fixture(scope="module")
-def module_farm() -> Iterator[Plants]:
+def module_farm(request: pytest.FixtureRequest) -> Iterator[Plants]:
     """Runs appliances that the tests of a file share, and ends them."""
     with plants() as folder:
+        folder.is_real = hasattr(request.module, "IS_ABOUT_PROCESSES")
         folder.state = folder.folder / "state"
         yield folder

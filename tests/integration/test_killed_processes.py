@@ -21,6 +21,7 @@ from tests.support.listener import Listener, listen_to_group
 from tests.support.machine import slowness
 
 pytestmark = pytest.mark.net
+IS_ABOUT_PROCESSES = True
 
 GROUP, SENDER = "239.9.4.1", "127.9.4.1"
 CYCLE_NS = 10_000_000

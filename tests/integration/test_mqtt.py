@@ -9,7 +9,6 @@ import socket
 import struct
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -116,24 +115,15 @@ def test_subscription_outlives_its_broker_and_the_client_may_have_any_net_id(hal
 def test_station_whose_services_die_is_down_at_once_and_comes_back(halls):
     until_read(SOUTH, by=NORTH)
     _, south = halls
-    supervisor = south.process.pid
+    supervisor, south_services = south.process.pid, south.pid("services")
     os.kill(supervisor, signal.SIGSTOP)  # so that nobody starts them again yet
     try:
-        os.kill(south_services := _services_of(supervisor), signal.SIGKILL)
+        os.kill(south_services, signal.SIGKILL)
         wait_until(lambda: read(SOUTH, NORTH) == -UNREACHABLE)
     finally:
         os.kill(supervisor, signal.SIGCONT)
     until_read(SOUTH, by=NORTH)
     assert south.pid("services") != south_services
-
-
-def _services_of(supervisor: int) -> int:
-    children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
-    return next(
-        int(child)
-        for child in children
-        if b"services" in Path(f"/proc/{child}/cmdline").read_bytes()
-    )
 
 
 def test_client_of_another_make_is_served_and_hostile_ones_are_not(halls):

@@ -22,6 +22,7 @@ from tests.support.appliance import Appliance, Plants, SharedAppliance, wait_unt
 from tests.support.machine import slowness
 
 pytestmark = pytest.mark.net
+IS_ABOUT_PROCESSES = True
 
 PLANT = """\
 plant: processes

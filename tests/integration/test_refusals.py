@@ -15,6 +15,7 @@ from tests.support.appliance import Plants
 from tests.support.namespaces import namespace
 
 pytestmark = pytest.mark.net
+IS_ABOUT_PROCESSES = True
 
 ADDRESS = "127.9.6.2"
 PLANT = """\

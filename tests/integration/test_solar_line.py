@@ -15,6 +15,7 @@ from tests.support.appliance import Appliance, Plants, troubles
 from tests.support.machine import slowness
 
 pytestmark = pytest.mark.net
+IS_ABOUT_PROCESSES = True
 
 PLANT = Path(__file__).parents[2] / "config/solar-line.yaml"
 STATIONS = [f"island-{number:02}" for number in range(1, 15)] + ["control"]

@@ -24,6 +24,7 @@ from eap.cli.group import main as eapctl
 from eap.errors import ControlError
 from eap.ops.client import connect_those
 from eap.runtime.folder import VARIABLE
+from tests.support import preloaded
 
 EAPCTL = [sys.executable, "-m", "eap"]
 READY_S = 90.0
@@ -32,7 +33,10 @@ _PROGRESS = re.compile(r"^supervisor: .* has been starting for .*\n", re.MULTILI
 
 
 class Appliance:
-    """A running appliance with a runtime directory of its own, wherever its network is."""
+    """A running appliance with a runtime directory of its own, wherever its network is.
+
+    Unless it *is_real* its processes are forked, see :mod:`tests.support.preloaded`.
+    """
 
     def __init__(
         self,
@@ -41,12 +45,15 @@ class Appliance:
         runtime: Path,
         prefix: Sequence[str] = (),
         state: Path | None = None,
+        is_real: bool = False,
     ) -> None:
         self.runtime = runtime
         self._prefix = prefix
         self._state = {"EAP_STATE_DIR": str(state)} if state else {}
         words = [str(plant), *arguments] if plant else arguments
-        self.process = subprocess.Popen(
+        is_forked = not is_real and preloaded.is_possible(prefix)
+        start = preloaded.start if is_forked else subprocess.Popen
+        self.process: subprocess.Popen[str] = start(
             [*prefix, *EAPCTL, "run", *words],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -183,11 +190,13 @@ class Plants:
 
     Attributes:
         state: Folder of what appliances keep; None for that of the test that starts them.
+        is_real: Whether appliances start as programs of their own, which takes four times as long.
     """
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder = folder
         self.state: Path | None = None
+        self.is_real = False
         self._stack = stack
         self._count = 0
 
@@ -208,7 +217,14 @@ class Plants:
         self._count += 1
         folder = runtime or self.folder / f"run{self._count}"
         return self._stack.enter_context(
-            Appliance(plant, *arguments, runtime=folder, prefix=prefix, state=self.state)
+            Appliance(
+                plant,
+                *arguments,
+                runtime=folder,
+                prefix=prefix,
+                state=self.state,
+                is_real=self.is_real,
+            )
         )
 
     def run(self, plant: Path, *arguments: str, prefix: Sequence[str] = ()) -> Appliance:

@@ -15,6 +15,9 @@ from eap.ids import MacAddr
 
 _NUMBERS = itertools.count()
 _CLONE_NEWNET = 0x40000000
+_CLONE_NEWNS = 0x20000
+_MS_REC, _MS_SLAVE = 0x4000, 0x80000
+_MNT_DETACH = 2
 _library = ctypes.CDLL(None, use_errno=True)
 
 
@@ -124,6 +127,22 @@ def enter(inside: Namespace) -> None:
     """Take the calling thread into a namespace, for good."""
     with Path(f"/run/netns/{inside.name}").open() as ns:
         enter_network(ns.fileno())
+
+
+def become_inside(name: str) -> None:
+    """Take this process into a namespace as ``ip netns exec`` does, with its view of ``/sys``."""
+    with Path(f"/run/netns/{name}").open() as ns:
+        enter_network(ns.fileno())
+    if _library.unshare(_CLONE_NEWNS):
+        raise OSError(ctypes.get_errno(), "unshare")
+    for source, target, kind, flags in (
+        (b"", b"/", b"none", _MS_SLAVE | _MS_REC),
+        (name.encode(), b"/sys", b"sysfs", 0),
+    ):
+        if target == b"/sys":
+            _library.umount2(target, _MNT_DETACH)
+        if _library.mount(source, target, kind, ctypes.c_ulong(flags), None):
+            raise OSError(ctypes.get_errno(), f"mount {target.decode()}")
 
 
 def enter_network(descriptor: int) -> None:
