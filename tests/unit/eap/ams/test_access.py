@@ -239,13 +239,15 @@ def test_senders_on_ethernet_have_mac_addresses(transport, connection, fits) -> 
         (Endpoint("ethernet:eap1", "02:00:00:00:00:0b"), None, False),
         (Endpoint("mqtt:line", "5.1.1.1.1.1"), None, True),
         (Endpoint("mqtt:lines", "5.1.1.1.1.1"), None, False),
+        (Endpoint("ams-tls:panel", "10.9.9.9:4711#1"), None, True),
+        (Endpoint("ams-tls:panel-2", "10.9.9.9:4711#2"), None, False),
+        (Endpoint("ams-tcp", "10.9.9.9:4711#3"), None, False),
         (Endpoint("web", "10.0.0.6"), Role.OPERATOR, True),
         (Endpoint("web", "10.0.0.5"), Role.VIEWER, False),
     ],
 )
 def test_rule_with_roles_fits_logged_in_users_by_role_and_others_by_address(endpoint, role, fits):
-    rule = AccessRule(
-        "r", roles=(Role.OPERATOR,), members=("10.0.0.5/32", "02:00:00:00:00:0a", "mqtt:line")
-    )
+    members = ("10.0.0.5/32", "02:00:00:00:00:0a", "mqtt:line", "ams-tls:panel")
+    rule = AccessRule("r", roles=(Role.OPERATOR,), members=members)
     found = AccessList([rule]).grants(endpoint, ENGINEER, *SLAVE, role)
     assert found.decide(WRITE).is_allowed is fits
