@@ -140,6 +140,7 @@ class EventLog:
             slaves = _slaves(earlier)
             changed: dict[tuple[str, str, str], list[str]] = {}
             for (port, slave), state in _slaves(station).items():
+                # A slave that is new to the log has no state before.
                 if (old := slaves.get((port, slave), state)) != state:
                     changed.setdefault((port, old, state), []).append(slave)
             for (port, old, state), names in changed.items():
@@ -275,6 +276,7 @@ def _received(key: str) -> _Counters:
 
 
 def _dropped(station: Row) -> Iterator[tuple[str, str, int]]:
+    # Frames that are of no PD count for their station.
     yield "", "", count_dropped(station)
     for row in station["pd"]["rx"]:
         yield "", row["name"], count_dropped(row)

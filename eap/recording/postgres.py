@@ -84,6 +84,7 @@ class PostgresStore:
                 for number, own in by_table.items():
                     table = self._tables[number]
                     names = ["time", "time_ns", "cycle", *column_names(table)]
+                    # COPY takes many times the rows a second that INSERT does.
                     command = sql.SQL("COPY {} ({}) FROM STDIN").format(
                         sql.Identifier(self._plant, table.station),
                         sql.SQL(",").join(map(sql.Identifier, names)),
@@ -109,6 +110,7 @@ class PostgresStore:
     def _prepare(self) -> None:
         schema = sql.Identifier(self._plant)
         with self._connection.transaction(), self._connection.cursor() as cursor:
+            # IF NOT EXISTS sends a notice for each table and column that there is already.
             cursor.execute("SET client_min_messages = warning")
             cursor.execute(sql.SQL("CREATE SCHEMA IF NOT EXISTS {}").format(schema))
             cursor.execute(
@@ -135,6 +137,7 @@ class PostgresStore:
                     for column, value in columns
                 ]
                 cursor.execute(sql.SQL("ALTER TABLE {} {}").format(name, sql.SQL(", ").join(added)))
+                # Without the extension they are ordinary tables, with the same columns.
                 if has_timescale:
                     cursor.execute(
                         "SELECT create_hypertable(%s::regclass, 'time', if_not_exists => TRUE,"

@@ -119,6 +119,7 @@ class ReplayStatus(Closeable):
 
     def close(self) -> None:
         """Remove the folder and close the socket."""
+        # close() alone would leave accept() waiting in its thread.
         with suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._thread.join()

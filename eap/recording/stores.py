@@ -237,6 +237,7 @@ class StoreSequence:
     def add_event(self, event: RecordingEvent) -> None:
         """Queue an event."""
         self._events.append(event)
+        # Bounded as the rows are, while the store does not answer.
         del self._events[:-1000]
 
     def flush(self) -> None:
@@ -283,6 +284,7 @@ class StoreSequence:
         try:
             step()
         except StoreError as exc:
+            # The connection may be in any state now: the next attempt opens another one.
             self._store.close()
             if exc.is_final:
                 raise EnvironmentalError(f"{self._url}: {exc}") from None
