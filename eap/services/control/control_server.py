@@ -422,15 +422,16 @@ class _Client:
 
     async def _answer(self, line: bytes, reader: _Reader, group: asyncio.TaskGroup) -> None:
         number = None
+        watch: Watch | None = None
         try:
             request = decode_request(line)
             number = request.id
             self._check_role(request)
             if request.method == "subscribe":
-                await self._subscribe(number, request.params, group)
-                return
-            async with reader.while_there():
-                result = await self._call_audited(request)
+                result, watch = self._subscribe(request.params)
+            else:
+                async with reader.while_there():
+                    result = await self._call_audited(request)
         # The client has disconnected, see while_there(): no answer can be sent.
         except TimeoutError:
             raise
@@ -438,7 +439,11 @@ class _Client:
             number = request_id(line) if number is None else number
             await self.send(encode_failure(number, failure_of(exc)))
         else:
+            # Sent before its task starts: the client knows the number when the first event comes.
             await self.send(encode_result(number, result))
+            if watch is not None:
+                task = group.create_task(self._events(result.subscription, watch))
+                self.subscriptions[result.subscription] = task
 
     def _check_role(self, request: Request) -> None:
         """Raise ControlError, after writing it down, if the client's role does not allow it."""
@@ -485,18 +490,13 @@ class _Client:
             return await self._bus.call(request.method, request.params)
         return await self._methods.call(request.method, request.params)
 
-    async def _subscribe(
-        self, number: int | None, params: dict[str, Any], group: asyncio.TaskGroup
-    ) -> None:
+    def _subscribe(self, params: dict[str, Any]) -> tuple[Subscribed, Watch]:
         if len(self.subscriptions) >= MAX_SUBSCRIPTIONS:
             reason = f"this connection has {MAX_SUBSCRIPTIONS} subscriptions, which is the limit"
             raise ControlError(reason, code=ErrorCode.BUSY)
         watch = self._methods.watch(params)
         self._last_subscription += 1
-        subscription = self._last_subscription
-        # Sent before its task starts: the client knows the number when the first event comes.
-        await self.send(encode_result(number, Subscribed(subscription)))
-        self.subscriptions[subscription] = group.create_task(self._events(subscription, watch))
+        return Subscribed(self._last_subscription), watch
 
     def _unsubscribe(self, params: dict[str, Any]) -> Unsubscribed:
         subscription = parameters(params, UnsubscribeParameters).subscription

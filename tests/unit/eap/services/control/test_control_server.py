@@ -395,6 +395,19 @@ def test_requests_before_a_disconnect_are_executed(files):
     asyncio.run(conversation())
 
 
+def test_subscriber_that_has_left_already_is_no_defect(methods, caplog):
+    async def conversation():
+        ours, theirs = socket.socketpair()
+        params = b'{"station":"left","names":["name"],"period_ms":10}'
+        line = b'{"v":1,"id":1,"method":"subscribe","params":%s}\n' % params
+        with ours:
+            ours.sendall(line * 6)
+        await asyncio.wait_for(serve_client(ControlServer(methods, NO_BUSES), theirs), 5)
+
+    asyncio.run(conversation())
+    assert caplog.messages == []
+
+
 def test_errors_of_a_bus_keep_kind_and_detail(methods):
     async def conversation():
         engine = FakeEngine(FakeBus(LoopBus("drive")))
