@@ -67,7 +67,7 @@ from eap.control.protocol import (
 )
 from eap.errors import CodecError, ControlError
 from eap.ids import NetId
-from eap.live.transport import ValuesSubscription, gone
+from eap.live.transport import ValuesSubscription, end_requests, gone
 from eap.ops.client import checked
 from eap.services.tasks import TaskSet
 
@@ -320,9 +320,7 @@ class AdsConnection:
         if self._error is not None:
             return
         self._error = gone(why)
-        for answer in self._waiting.values():
-            if not answer.done():
-                answer.set_exception(self._error)
+        end_requests(self._waiting.values(), self._error)
 
 
 def _refused(result: int, what: str) -> ControlError:

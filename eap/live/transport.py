@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -73,6 +73,14 @@ class PlantConnection(Protocol):
 def gone(why: str) -> ControlError:
     """Return the error of a connection that has ended."""
     return ControlError(why, code=ErrorCode.UNAVAILABLE)
+
+
+def end_requests(answers: Iterable[asyncio.Future[Any]], error: ControlError) -> None:
+    """Raise *error* in all requests that wait for *answers*."""
+    for answer in answers:
+        if not answer.done():
+            answer.set_exception(error)
+            answer.exception()  # so that asyncio does not miss a requester just cancelled
 
 
 class UnixConnection:
@@ -168,10 +176,7 @@ class UnixConnection:
         if self._error is not None:
             return
         self._error = gone(why)
-        for answer in self._waiting.values():
-            if not answer.done():
-                answer.set_exception(self._error)
-                answer.exception()  # so that asyncio does not miss a requester just cancelled
+        end_requests(self._waiting.values(), self._error)
         for watch in self._watches.values():
             watch.end(self._error)
 
