@@ -234,7 +234,7 @@ def test_curves_that_nobody_sees_are_bounded(tab: Callable[..., Tab]):
     assert kept <= 1210
 
 
-def test_page_whose_file_did_not_come_loads_again(tab: Callable[..., Tab]):
+def test_page_loads_again_after_missing_file(tab: Callable[..., Tab]):
     one = tab()
     failed: list[str] = []
 
@@ -322,7 +322,7 @@ def test_operator_sets_a_set_point_and_logs_out(tab: Callable[..., Tab], plant: 
     panel.get_by_text("yours is viewer").wait_for()
 
 
-def test_required_comment_is_asked_for_and_kept(tab: Callable[..., Tab], plant: Appliance):
+def test_page_requests_required_comment_and_keeps_it(tab: Callable[..., Tab], plant: Appliance):
     one = tab()
     one.log_in("otto", PASSWORD)
     panel = one.page.locator(".panel-set", has_text="island-03/alarm")

@@ -214,7 +214,7 @@ def test_small_tpdus_limit_the_pdu() -> None:
     assert raw(peer, setup).parameters.hex() == "f000000800080" + f"{509:03x}"
 
 
-def test_modbus_unit_of_somebody_else_is_no_path() -> None:
+def test_modbus_session_answers_other_unit_with_no_path() -> None:
     session = ModbusSession(ServedMemory([]), 3)
     peer = Peer(ModbusLink(ModbusController(host="a")), session)
     request = ModbusFrame(1, 4, bytes.fromhex("0300000001"))

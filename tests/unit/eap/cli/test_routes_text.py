@@ -22,7 +22,7 @@ def test_counts_have_five_characters(number: int, text: str) -> None:
     assert routes_view.short(number) == text
 
 
-def test_ages() -> None:
+def test_elapsed_times_are_whole_seconds_up_to_two_minutes() -> None:
     assert [routes_view.elapsed(each) for each in (0, 119, 180, 7200)] == [
         "0 s",
         "119 s",
