@@ -17,7 +17,8 @@ from eap.ams.spec import (
     Role,
     TransportKind,
 )
-from eap.config.brokers import brokers_of, check_file
+from eap.config.brokers import brokers_of
+from eap.config.files import check_file
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.ports import check_names

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from eap.ams.mqtt.messages import check_network
 from eap.ams.spec import MqttSpec, TlsSpec, TransportKind
+from eap.config.files import check_file, whole_path
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index
 from eap.config.mqtt_sections import MqttSection
@@ -72,7 +73,7 @@ def broker_spec(route: RouteSection, folder: Path) -> MqttSpec:
         host=broker.host,
         port=broker.port,
         user=route.user,
-        password_file=_path(folder, route.password_file),
+        password_file=whole_path(folder, route.password_file),
         tls=None if tls is None else _tls(tls, folder),
         client_id=route.client_id,
         no_retain=route.no_retain,
@@ -84,19 +85,14 @@ def broker_spec(route: RouteSection, folder: Path) -> MqttSpec:
 
 def _tls(tls: TlsSection, folder: Path) -> TlsSpec:
     return TlsSpec(
-        ca=_path(folder, tls.ca),
-        certificate=_path(folder, tls.certificate),
-        key=_path(folder, tls.key),
+        ca=whole_path(folder, tls.ca),
+        certificate=whole_path(folder, tls.certificate),
+        key=whole_path(folder, tls.key),
         check_name=tls.check_name,
     )
 
 
-def _path(folder: Path, file: str) -> str:
-    return str((folder / file).resolve()) if file else ""
-
-
 _NETWORK = "one level of a topic: up to 128 characters, no spaces, no / + #, and no $ in front"
-_FILE = "a file, its path from the plant file on"
 _MAX_CLIENT_ID = 65_535
 
 
@@ -179,26 +175,7 @@ def check_credentials(
         report.add(f"{at}.key", "a key without a certificate", "certificate: as well")
 
 
-def check_file(path: str, file: str, report: FindingReport, folder: Path) -> None:
-    """Report *file*, named at *path*, if it is given and cannot be read."""
-    if file and (reason := unreadable_reason(folder / file)):
-        report.add(path, f"{file}: {reason}", _FILE)
-
-
 HOST = "an IPv4 address or a host name, and :PORT if it is not the usual one"
-
-
-def unreadable_reason(file: Path) -> str:
-    """Return the reason that *file* cannot be read as a whole; empty if it can."""
-    try:
-        # A directory gets its usual error from open(); a pipe would block it.
-        if file.exists() and not file.is_file() and not file.is_dir():
-            return "no regular file"  # a pipe would keep us waiting
-        with file.open("rb") as opened:
-            opened.read(1)
-    except (OSError, ValueError) as exc:  # ValueError: a NUL in the path
-        return f"{exc.strerror if isinstance(exc, OSError) else exc}"
-    return ""
 
 
 _MQTT = f"{TransportKind.MQTT}:"

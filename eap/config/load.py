@@ -50,6 +50,7 @@ from eap.config.eoe import check_eoe, eoe_spec
 from eap.config.exchange import check_polls, check_publish, check_subscribe
 from eap.config.exposure import Exposure, find_exposures
 from eap.config.field import check_field, field_bridge_on, field_bridges, resolved_source
+from eap.config.files import whole_path
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.hosts import check_hosts, is_served_on
 from eap.config.index import Index, SentPd, VariablePart
@@ -82,7 +83,6 @@ from eap.config.structs import (
     PortSection,
     StationSection,
     SubscribeSection,
-    UserSection,
     VariableSection,
 )
 from eap.config.types import TypeTable, resolve_types
@@ -156,13 +156,8 @@ def _station(index: Index, station: StationSection, phase_us: int, folder: Path)
         frames=tuple(_frames(index, station)),
         subscriptions=tuple(_subscription(index, each) for each in station.subscribe),
         links=tuple(_links(index, station)),
-        pd_keys=_path(folder, index.pd_keys(station)),
+        pd_keys=whole_path(folder, index.pd_keys(station)),
     )
-
-
-def _path(folder: Path, name: str) -> str:
-    """Return a file of the plant file by its whole path; empty stays so."""
-    return str((folder / name).resolve()) if name else ""
 
 
 def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
@@ -241,7 +236,7 @@ def _variable(name: str, variable: VariableSection, writer: Writer) -> VariableS
 def _source(index: Index, source: Source, folder: Path) -> Source:
     # Relative to the plant file, and not to the working directory of services.
     if isinstance(source, CsvSource):
-        return msgspec.structs.replace(source, file=str((folder / source.file).resolve()))
+        return msgspec.structs.replace(source, file=whole_path(folder, source.file))
     return resolved_source(index, source)
 
 
@@ -411,16 +406,14 @@ def derive_routing(index: Index, folder: Path) -> dict[str, RoutingSpec]:
             ),
             mqtt=tuple(broker_spec(each, folder) for each in brokers_of(station)),
             access=tuple(access_rules(index, station, shared)),
-            users=tuple(AmsUser(user.name, _password_file(user, folder)) for user in station.users),
+            users=tuple(
+                AmsUser(user.name, whole_path(folder, user.password_file)) for user in station.users
+            ),
             learn=discovery_sources(station),
             secure=secure_ads_spec(station.secure_ads, folder),
         )
         for station in index.plant.stations
     }
-
-
-def _password_file(user: UserSection, folder: Path) -> str:
-    return str((folder / user.password_file).resolve()) if user.password_file else ""
 
 
 def derive_directory(index: Index) -> tuple[DirectoryStation, ...]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from eap.ams.spec import Role
-from eap.config.brokers import check_file
+from eap.config.files import check_file, whole_path
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index
 from eap.config.listen import parse_listen
@@ -34,7 +34,7 @@ def resolved_opcua(opcua: OpcUaSection, folder: Path, operators: tuple[str, ...]
     opcua = replace(opcua, operators=opcua.operators or operators)
     if not opcua.certificate:
         return opcua
-    certificate, key = (str((folder / each).resolve()) for each in (opcua.certificate, opcua.key))
+    certificate, key = (whole_path(folder, each) for each in (opcua.certificate, opcua.key))
     return replace(opcua, certificate=certificate, key=key)
 
 

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 from msgspec.structs import replace
 
+from eap.config.files import whole_path
 from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.record_sections import RecordKind, RecordSection
@@ -37,11 +38,7 @@ def resolved_recordings(
     sections: Sequence[RecordSection], folder: Path
 ) -> tuple[RecordSection, ...]:
     """Return *sections* with the paths of their folders from *folder* on."""
-    found = []
-    for each in sections:
-        target = str((folder / each.folder).resolve()) if each.folder else ""
-        found.append(replace(each, folder=target))
-    return tuple(found)
+    return tuple(replace(each, folder=whole_path(folder, each.folder)) for each in sections)
 
 
 def records_of(section: RecordSection, stations: Iterable[str]) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from eap.ams.spec import PskSpec, SecureAdsSpec, SecurePeer, SecureRouteSpec
 from eap.codec.tlshandshake import parse_fingerprint
-from eap.config.brokers import check_file
+from eap.config.files import check_file, whole_path
 from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.structs import RouteSection, SecureAdsSection, StationSection, TlsSection
@@ -25,13 +25,13 @@ def secure_ads_spec(section: SecureAdsSection | None, folder: Path) -> SecureAds
     if section is None:
         return None
     return SecureAdsSpec(
-        certificate=_path(folder, section.certificate),
-        key=_path(folder, section.key),
-        ca=_path(folder, section.ca),
+        certificate=whole_path(folder, section.certificate),
+        key=whole_path(folder, section.key),
+        ca=whole_path(folder, section.ca),
         peers=tuple(
             SecurePeer(name, parse_fingerprint(text)) for name, text in section.peers.items()
         ),
-        psk=tuple(PskSpec(name, _path(folder, file)) for name, file in section.psk.items()),
+        psk=tuple(PskSpec(name, whole_path(folder, file)) for name, file in section.psk.items()),
         port=section.port,
     )
 
@@ -42,16 +42,12 @@ def secure_route_spec(tls: TlsSection | None, folder: Path) -> SecureRouteSpec |
         return None
     return SecureRouteSpec(
         fingerprint=parse_fingerprint(tls.fingerprint) if tls.fingerprint else "",
-        psk=PskSpec(tls.identity, _path(folder, tls.password_file)) if tls.identity else None,
-        ca=_path(folder, tls.ca),
-        certificate=_path(folder, tls.certificate),
-        key=_path(folder, tls.key),
+        psk=PskSpec(tls.identity, whole_path(folder, tls.password_file)) if tls.identity else None,
+        ca=whole_path(folder, tls.ca),
+        certificate=whole_path(folder, tls.certificate),
+        key=whole_path(folder, tls.key),
         check_name=tls.check_name,
     )
-
-
-def _path(folder: Path, file: str) -> str:
-    return str((folder / file).resolve()) if file else ""
 
 
 def check_secure_ads(index: Index, report: FindingReport, folder: Path) -> None:

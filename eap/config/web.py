@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from eap.ams.spec import Role
 from eap.codec import datatypes
-from eap.config.brokers import check_file
+from eap.config.files import check_file, whole_path
 from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
 from eap.config.listen import parse_listen
@@ -112,8 +112,8 @@ def resolved_tls(section: ServerT, folder: Path) -> ServerT:
     """Return *section* with the paths of certificate and key from *folder* on."""
     tls = section.tls and replace(
         section.tls,
-        certificate=str((folder / section.tls.certificate).resolve()),
-        key=str((folder / section.tls.key).resolve()),
+        certificate=whole_path(folder, section.tls.certificate),
+        key=whole_path(folder, section.tls.key),
     )
     return replace(section, tls=tls)
 
@@ -123,7 +123,7 @@ def resolved(web: WebSection, folder: Path) -> WebSection:
 
     def panel(each: Panel) -> Panel:
         if isinstance(each, PicturePanel):
-            return replace(each, file=str((folder / each.file).resolve()))
+            return replace(each, file=whole_path(folder, each.file))
         return each
 
     pages = tuple(replace(page, panels=tuple(map(panel, page.panels))) for page in web.pages)

@@ -13,8 +13,8 @@ from eap.config.brokers import (
     find_network,
     parse_url,
     shared_network,
-    unreadable_reason,
 )
+from eap.config.files import unreadable_reason
 from eap.config.structs import RouteSection, StationSection, TlsSection
 from eap.ids import NetId
 
