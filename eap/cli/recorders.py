@@ -68,7 +68,7 @@ def _parse_split(ctx: click.Context, param: click.Parameter, text: str | None) -
 @click.command(
     epilog=examples(
         "eapctl record start -o line",
-        "eapctl record start 'island-*/temp' -o temp --every 100ms --split 1h --keep 24",
+        "eapctl record start 'island-*/temp' -o t --every 100ms --split 1h --keep 24",
         "eapctl record start island-03 --frames -o island --for 60s",
         "eapctl record start -o fault --ring 60s --when 'island-03/temp>80 or lost'",
         "eapctl record start --to postgresql://logger@db.example/plant",
