@@ -175,6 +175,20 @@ class BridgeFeed:
         self._watches: dict[str, asyncio.Task[None]] = {}
         self._by_station: dict[str, tuple[BridgeVariable, ...]] = {}
         self._has_gone = asyncio.Event()
+        self._to_report: set[str] = set()
+
+    def report_again(self, written: str) -> None:
+        """Report the next value of a variable even if it is the one before.
+
+        A bridge that shows its clients what they wrote calls this: where the plant sets the value
+        back within a period, no change would be seen.
+
+        Args:
+            written: ``STATION/NAME``, or a member or element of it.
+        """
+        for name in self.variables:
+            if written == name or (written.startswith(name) and written[len(name)] in ".["):
+                self._to_report.add(name)
 
     async def run(self) -> None:
         """Follow the appliance until cancelled."""
@@ -252,8 +266,10 @@ class BridgeFeed:
             before = self.samples.get(name)
             sample = Sample(value, quality, event.time_ns - age * QUALITY_NS)
             self.samples[name] = sample
-            if before is None or before.value != value or before.quality is not quality:
+            is_as_before = before is not None and before[:2] == sample[:2]
+            if not is_as_before or name in self._to_report:
                 changed[name] = sample
+                self._to_report.discard(name)
         if changed:
             self._on_values(changed)
 

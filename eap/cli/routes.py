@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -163,12 +163,15 @@ def add(
     from eap.control.routes import ROUTES_ADD
     from eap.ops.client import connect_station
 
+    # Appliances of the release before refuse parameters that they do not know.
+    secure: dict[str, Any] = {}
+    if fingerprint or any_name:
+        secure = {"fingerprint": fingerprint, "check_name": not any_name}
     with connect_station(station, plant) as client:
         added = client.call(
             ROUTES_ADD, station=station, name=name, net_id=net_id, via=via, port=port,
             octets=int(octets), virtual=virtual, unidirectional=unidirectional,
-            timeout_ms=timeout_ms or 0, probed=not no_probe, fingerprint=fingerprint,
-            check_name=not any_name,
+            timeout_ms=timeout_ms or 0, probed=not no_probe, **secure,
         )  # fmt: skip
     route = added.route
     output.show(added, lambda _: f"{station}: added {name} ({route.net_id}, {path_of(route)})")
@@ -413,6 +416,10 @@ def add_remote(
     from eap.control.routes import ROUTES_ADD_REMOTE
     from eap.ops.client import connect_station
 
+    # As above: only where it is used.
+    secure: dict[str, Any] = {}
+    if tls or fingerprint:
+        secure = {"tls": True, "fingerprint": fingerprint}
     with connect_station(station, plant) as client:
         answer = client.call(
             ROUTES_ADD_REMOTE,
@@ -423,8 +430,7 @@ def add_remote(
             user=user,
             password=password,
             wait_ms=wait_ms,
-            tls=tls or bool(fingerprint),
-            fingerprint=fingerprint,
+            **secure,
         )
     output.show(answer, lambda each: f"{address}: {each.text}")
     if not answer.ok:

@@ -181,7 +181,7 @@ def run_app(
         from eap.cli.routes_tui.table import RemoteRouters, RouterClient, RouteRequests
         from eap.cli.top_tui.app import READ_ONLY, TopApp
     except ModuleNotFoundError as exc:
-        if exc.name != "textual":
+        if (exc.name or "").partition(".")[0] != "textual":
             raise
         raise _NoTextualError(
             "the live view needs Textual: install it with pip install 'eap-appliance[tui]', or use"

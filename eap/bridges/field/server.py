@@ -80,6 +80,7 @@ class FieldServing:
             ServedPoint(each.name, served_point(each, server), each.write) for each in server.items
         ]
         self.memory = ServedMemory(points)
+        self._feed = bridge.feed(self.memory.names, server.every_ms, on_values=self._show)
         self._complaints: dict[str, str] = {}
 
     async def run(self) -> None:
@@ -95,9 +96,8 @@ class FieldServing:
             self._bridge.connected(url)
             status.clients = 0
             self._bridge.ready()
-            feed = self._bridge.feed(self.memory.names, self._server.every_ms, on_values=self._show)
             try:
-                await feed.run()
+                await self._feed.run()
             finally:
                 server.close()
                 for task in self._tasks:
@@ -184,4 +184,5 @@ class FieldServing:
         # A client that reads at once gets what it wrote; the plant's value follows.
         for name, value in changes.items():
             self.memory.update(name, value)
+            self._feed.report_again(name)
         return ""

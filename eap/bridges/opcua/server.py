@@ -219,6 +219,7 @@ class PlantOpcUa:
             logger.info("%s by %s@%s: %s", node.node_id, client.user.name, client.host, exc)
             return ua.StatusCode(_code_of(exc))
         await self._space.take_part(node, plain)
+        self._feed.report_again(node.node_id)
         return ua.StatusCode()
 
     async def call(

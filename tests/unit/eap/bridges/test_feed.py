@@ -124,6 +124,20 @@ def test_feed_reports_only_changes_of_value_and_quality():
     ]
 
 
+def test_feed_reports_value_that_was_set_back_after_a_write():
+    scene = Scene("mixer/setpoint", "mixer/axis")
+    values = {"setpoint": 4, "axis": {"pos": 1.0, "speed": 0.0}}
+
+    async def script() -> None:
+        await scene.play(event(values))
+        scene.feed.report_again("mixer/setpoint")
+        scene.feed.report_again("mixer/axis.pos")
+        await scene.play(event(values, cycle=2), event(values, cycle=3))
+
+    play(scene, script)
+    assert [list(each) for each in scene.changes] == 2 * [["mixer/setpoint", "mixer/axis"]]
+
+
 def test_feed_value_never_received_is_bad():
     scene = Scene("mixer/speed")
 
