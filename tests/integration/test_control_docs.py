@@ -26,7 +26,7 @@ LINES = [
     for block in re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
     for line in block.splitlines()
 ]
-OF_THIS_MACHINE = {"realtime", "release", "version", "interface", "file", "plant_file"}
+OF_THIS_MACHINE = {"realtime", "release", "version", "interface", "file", "plant_file", "compiled"}
 
 
 def outline(value: Any) -> Any:

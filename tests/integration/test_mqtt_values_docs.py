@@ -28,6 +28,7 @@ ADDRESS = "127.9.74.9"
 
 def outline(text: str) -> list[str]:
     """Return lines without what differs from run to run: numbers, and words that follow them."""
+    text = text.replace("engine (Python)", "engine")  # without the compiled part
     lines = re.sub(r"[0-9.]+( %| MB)?", "N", text).splitlines()
     return [re.sub(r"[\s─]+", " ", line).strip() for line in lines if line.strip()]
 

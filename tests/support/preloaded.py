@@ -8,10 +8,10 @@ done that once for all tests of a worker::
                  ├── nursery   of its own, forked before anything else; it forks the processes of
                  └── engine    the appliance, as children of the supervisor
 
-Signals, ends, descriptors, groups, limits, network and environment are as of processes that start
-by themselves; command lines are those of the nursery, and memory has what any of the processes
-imports.  Programs start instead with *is_real*, with a prefix that does more than to enter a
-namespace, with other settings of Python, in an appliance of which a process has ended, and
+Signals, ends, descriptors, groups, limits, umask, network and environment are as of processes that
+start by themselves; command lines are those of the nursery, and memory has what any of the
+processes imports.  Programs start instead with *is_real*, with a prefix that does more than to
+enter a namespace, with other settings of Python, in an appliance of which a process has ended, and
 everywhere with EAP_TEST_REAL=1.
 
 Run as a module, this is the nursery of a worker.
@@ -26,6 +26,7 @@ import gc
 import json
 import os
 import platform
+import re
 import resource
 import signal
 import socket
@@ -61,6 +62,12 @@ def _settings() -> dict[str, str]:
 _SETTINGS = _settings()
 
 
+def _umask() -> int:
+    """Return the umask of this process, which os.umask() tells only by changing it."""
+    (digits,) = re.findall(r"^Umask:\s*(\d+)", Path("/proc/self/status").read_text(), re.MULTILINE)
+    return int(digits, 8)
+
+
 def is_possible(prefix: Sequence[str]) -> bool:
     """Tell whether appliances that *prefix* starts may come from a nursery here and now."""
     is_plain = not prefix or (tuple(prefix[:3]) == _INSIDE and len(prefix) == 4)
@@ -93,6 +100,7 @@ class _Forked(subprocess.Popen[Any]):
             "group": more[-1],
             "limits": [(each, *resource.getrlimit(each)) for each in _LIMITS],
             "places": [0, 1, 2, *pass_fds],
+            "umask": _umask(),
         }
         network = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
         try:
@@ -176,6 +184,7 @@ def _become(
         signal.signal(signal.SIGINT, signal.default_int_handler)
         for number, *limits in request["limits"]:
             resource.setrlimit(number, limits)
+        os.umask(request["umask"])
         network, *descriptors = descriptors
         if not os.path.samestat(os.fstat(network), Path("/proc/thread-self/ns/net").stat()):
             enter_network(network)

@@ -6,10 +6,12 @@ import contextlib
 import ctypes
 import json
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -36,7 +38,12 @@ def veth_pair() -> Iterator[None]:
                 _ip(f"link add {near} type veth peer name {far}")
                 _ip(f"link set {near} up")
                 _ip(f"link set {far} up")
-            yield
+            # The product's socket for queries sees the network that it was made in.
+            with (
+                socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as queries,
+                mock.patch("eap.net.interface._kernel", return_value=queries),
+            ):
+                yield
         finally:
             library.setns(home.fileno(), _CLONE_NEWNET)
 
