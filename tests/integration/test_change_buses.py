@@ -105,12 +105,19 @@ class Works:
         return {name: value for name, value in values.items() if name.endswith(".state")}
 
     def wait_op(self, *ports: str) -> None:
-        wait_until(lambda: all(self.states().get(f"{port}.state") == 8 for port in ports))
+        def are_up() -> bool:
+            states = self.states()
+            own = [states[name] for name in states if name.startswith(ports)]
+            return set(own) == {8} and all(f"{port}.state" in states for port in ports)
+
+        wait_until(are_up)
 
     def report(self, port: str) -> Any:
         return self.appliance.request("bus_describe", station="press", port=port)
 
     def mode(self) -> str:
+        """Return the drive's mode, as soon as it is in OP: apply does not wait for buses."""
+        self.eapctl("bus", "state", "press/bus0", "drive", "OP")
         return self.eapctl("bus", "sdo", "read", "press/bus0", "drive", "0x6060")
 
     def undisturbed(self) -> tuple[Any, ...]:

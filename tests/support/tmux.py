@@ -71,3 +71,5 @@ def terminal(
         yield found
     finally:
         subprocess.run(["tmux", "-S", str(socket), "kill-server"], check=False, capture_output=True)
+        # A server that is still ending would refuse the next session.
+        socket.unlink(missing_ok=True)
