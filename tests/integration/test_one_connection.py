@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.appliance import Appliance, Plants, plants
+from tests.support.appliance import Appliance, Plants, plants, run_eapctl
 from tests.support.eventually import wait_until
 from tests.support.npm import NODE_MODULES, needs_npm, node_environment
 
@@ -169,6 +169,9 @@ def wait_for_each(clients: list[Consumer], condition: Callable[[list[int]], obje
 @needs_npm("node-red", "node-red-contrib-ads-client", "ads-client")
 def test_four_clients_share_one_connection_and_outlive_the_controller(folder, edge, tmp_path):
     press = start_press(folder)
+    # While the route waits for its next attempt, requests are answered with "host unreachable".
+    route = ["routes", "test", "edge", "press"]
+    wait_until(lambda: run_eapctl(edge.runtime, *route).returncode == 0)
     with ExitStack() as stack:
         clients = start_clients(tmp_path, stack)
         wait_for_each(clients, lambda values: len(values) > 3)
@@ -198,7 +201,7 @@ def test_four_clients_share_one_connection_and_outlive_the_controller(folder, ed
             assert each.values()[-1] < before
         assert connections(edge) == len(clients)
         assert connections(press) == 1
-    assert "no errors" in edge.command("status")
+    wait_until(lambda: "no errors" in edge.command("status"))
     (line,) = re.findall(r"^edge  .*$", PAGE, re.MULTILINE)
     shown = edge.command("routes", "list", "edge")
     assert without_figures(line) in [without_figures(each) for each in shown.splitlines()], shown
