@@ -40,11 +40,11 @@ if TYPE_CHECKING:
 _JSON = json_option("Print one object per gateway; docs/control.md explains its fields.")
 _TARGET = click.argument("target", metavar="STATION[/PORT]", shell_complete=complete_target)
 _SHOWN_CLIENTS = 10
+"""Number of clients that are shown: each command is a client, so there may be hundreds."""
 _PORT = 34980
 _TCP, _MAILBOX = "--tcp", "--mailbox"
 _FIRST_OF_COMMAND = 2
 """Words until the options of a command may come: HOST and its name."""
-"""Number of clients that are shown: each command is a client, so there may be hundreds."""
 
 
 @click.group(
