@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import struct
@@ -34,6 +35,7 @@ READS = 50
 SETS = 5
 _NEARLY_ALWAYS, _HARDLY_EVER = 0.8, 0.2
 _PATIENCE_S = 60
+_TRACED = re.compile(rb"eap\.(engine|services)\.process")
 _BUS, _ADDRESS = bytes((127, 0, 1, 1, 3, 1)), "127.0.1.1"
 """The first bus of ``config/demo.yaml``, and the address of its station."""
 
@@ -67,10 +69,13 @@ class _Plant:
         }
 
     def find_processes(self, supervisor: int) -> None:
-        """Remember the engine and services; the simulated buses are processes of their own."""
+        """Remember the engine and services.
+
+        The page's server may not have loaded the tracer yet: a signal would end it.
+        """
         path = Path(f"/proc/{supervisor}/task/{supervisor}/children")
         children = map(int, path.read_text().split())
-        self._pids = [pid for pid in children if b"segment" not in _command_line(pid)]
+        self._pids = [pid for pid in children if _TRACED.search(_command_line(pid))]
 
     def set_value(self) -> None:
         """Run ``eapctl pd set`` to its end."""
