@@ -9,7 +9,7 @@ ARGS ?=
 
 BIN := .venv/bin
 # A new source is compiled by installing the project again.
-COMPILED := eap/_cyclic.c tools/package/compiled.py
+COMPILED := $(wildcard eap/cyclic/*.[ch]) tools/package/compiled.py
 
 # Where it is set, each process of an appliance would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE

@@ -1,4 +1,4 @@
-"""The compiled part of the cyclic path, ``eap/_cyclic.c``, where it was built.
+"""The compiled part of the cyclic path, ``eap/cyclic``, where it was built.
 
 Python code does the same, slower: it is the reference, and what the compiled part leaves to it.
 ``EAP_PURE=1`` in the environment of a process has it use Python alone.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from types import ModuleType
 
-_API = 1
+_API = 2
 """Of the source; a file that was built from an older one is not used."""
 
 

@@ -144,7 +144,6 @@ class ReceiveBatch:
         """
         if self._compiled is None and cyclic is not None:
             self._compiled = cyclic.Receiver(
-                self._headers,
                 self.octets,
                 self._control,
                 self._senders if self._with_senders else None,

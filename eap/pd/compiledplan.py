@@ -1,4 +1,4 @@
-"""Plans of frames and handlers of ports for the compiled part, ``eap/_cyclic.c``.
+"""Plans of frames and handlers of ports for the compiled part, ``eap/cyclic``.
 
 The compiled part takes a frame if its layout is known and usual, it comes from the same address as
 the one before, and no sequence tracker has to enter a loss, a reordered frame or a wrapped counter.

@@ -1,4 +1,4 @@
-"""Build hook of hatchling: compile ``eap/_cyclic.c`` where a compiler is.
+"""Build hook of hatchling: compile ``eap/cyclic`` where a compiler is.
 
 | build | result |
 |---|---|
@@ -23,7 +23,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-SOURCE = "eap/_cyclic.c"
+SOURCES = "eap/cyclic"
 TARGET = "eap/_cyclic.abi3.so"
 _LIMITED_API = "0x030B0000"
 _TAG = "cp311-abi3"
@@ -47,7 +47,7 @@ class CompiledPartHook(BuildHookInterface[Any]):
         except (OSError, subprocess.CalledProcessError) as exc:
             if os.environ.get("EAP_COMPILED", "0") not in {"", "0"}:
                 raise
-            self.app.display_warning(f"{SOURCE} was not compiled, so Python does its work: {exc}")
+            self.app.display_warning(f"{SOURCES} was not compiled, so Python does its work: {exc}")
             return
         if is_editable:
             return
@@ -63,7 +63,7 @@ class CompiledPartHook(BuildHookInterface[Any]):
 
 
 def compile_part(root: Path, target: Path) -> None:
-    """Compile the source below *root* to *target*; the same source gives the same bytes.
+    """Compile the sources below *root* to *target*; the same sources give the same bytes.
 
     Raises:
         OSError: there is no compiler.
@@ -75,7 +75,8 @@ def compile_part(root: Path, target: Path) -> None:
     # Beside the target and renamed: a process that runs has the old one mapped.
     made = target.with_name(f".{target.name}.{os.getpid()}")
     command = [*compiler, *flags, *shlex.split(os.environ.get("CFLAGS", ""))]
-    command += [f"-DPy_LIMITED_API={_LIMITED_API}", "-I", include, SOURCE, "-o", str(made)]
+    command += [f"-DPy_LIMITED_API={_LIMITED_API}", "-I", include, "-o", str(made)]
+    command += sorted(str(file.relative_to(root)) for file in (root / SOURCES).glob("*.c"))
     try:
         subprocess.run(command, cwd=root, check=True)
         made.replace(target)

@@ -1,0 +1,272 @@
+/* One batch of recvmmsg for the handlers of a socket.
+
+   eap/net/mmsg.py, udp.py and ethernet.py are the reference.  */
+
+#include "cyclic.h"
+
+#include <netinet/in.h>
+#include <time.h>
+
+enum { MAX_BATCHES = 4, CLOCK_NOISE_NS = 1000, SENDER = sizeof(struct sockaddr_in) };
+#define BILLION 1000000000LL
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *views;
+    Py_buffer octets, control, senders;
+    struct mmsghdr *headers;
+    struct iovec *vectors;
+    Py_ssize_t count, buffer_size, headroom, control_size;
+    int64_t offset_ns;
+    int busy;
+} Receiver;
+
+static void receiver_dealloc(Receiver *self) {
+    Py_XDECREF(self->views);
+    PyMem_Free(self->headers);
+    PyMem_Free(self->vectors);
+    release_buffer(&self->octets);
+    release_buffer(&self->control);
+    release_buffer(&self->senders);
+    free_object((PyObject *)self);
+}
+
+static int64_t clock_ns(clockid_t clock) {
+    struct timespec now;
+    clock_gettime(clock, &now);
+    return (int64_t)now.tv_sec * BILLION + now.tv_nsec;
+}
+
+static int64_t measure_offset(int64_t *now_ns) {
+    *now_ns = clock_ns(CLOCK_MONOTONIC);
+    return *now_ns - clock_ns(CLOCK_REALTIME);
+}
+
+/* As ReceiveBatch._read_clocks(). */
+static int64_t read_clocks(Receiver *self) {
+    int64_t now_ns, later_ns, offset_ns = measure_offset(&now_ns);
+    if (offset_ns < self->offset_ns - CLOCK_NOISE_NS) {
+        for (int again = 0; again < 3; again++) {
+            int64_t other_ns = measure_offset(&later_ns);
+            if (other_ns > offset_ns)
+                offset_ns = other_ns;
+        }
+        self->offset_ns = offset_ns;
+    } else if (offset_ns > self->offset_ns)
+        self->offset_ns = offset_ns;
+    return now_ns;
+}
+
+/* Let the kernel write into the memory of the batch and nowhere else. */
+static int describe(Receiver *self) {
+    Py_ssize_t count = self->count = PyList_Size(self->views);
+    if (count < 1 || self->octets.len % count || self->control.len != count * self->control_size
+        || self->control_size < (Py_ssize_t)(sizeof(struct cmsghdr) + sizeof(struct timespec))
+        || self->headroom < 0 || self->headroom > self->octets.len / count - SHORTEST
+        || (self->senders.buf != NULL ? self->senders.len != SENDER * count : self->headroom < 12))
+        return refuse("a batch has memory for each of its messages");
+    self->buffer_size = self->octets.len / count;
+    self->headers = PyMem_Calloc((size_t)count, sizeof *self->headers);
+    self->vectors = PyMem_Calloc((size_t)count, sizeof *self->vectors);
+    if (self->headers == NULL || self->vectors == NULL) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    for (Py_ssize_t n = 0; n < count; n++) {
+        struct msghdr *header = &self->headers[n].msg_hdr;
+        self->vectors[n].iov_base = (char *)self->octets.buf + n * self->buffer_size;
+        self->vectors[n].iov_len = (size_t)self->buffer_size;
+        header->msg_iov = &self->vectors[n];
+        header->msg_iovlen = 1;
+        header->msg_control = (char *)self->control.buf + n * self->control_size;
+        header->msg_controllen = (size_t)self->control_size;
+        if (self->senders.buf != NULL) {
+            header->msg_name = (char *)self->senders.buf + n * SENDER;
+            header->msg_namelen = SENDER;
+        }
+    }
+    return 0;
+}
+
+/* Receiver(octets, control, senders, control_size, headroom, views): of a ReceiveBatch. */
+static PyObject *receiver_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
+    PyObject *octets, *control, *senders, *views;
+    Py_ssize_t control_size, headroom;
+    if (!PyArg_ParseTuple(args, "OOOnnO!", &octets, &control, &senders, &control_size, &headroom,
+                          &PyList_Type, &views))
+        return NULL;
+    Receiver *self = (Receiver *)make_object(type, keywords);
+    if (self == NULL)
+        return NULL;
+    Py_INCREF(views);
+    self->views = views;
+    self->control_size = control_size;
+    self->headroom = headroom;
+    int64_t now_ns;
+    self->offset_ns = measure_offset(&now_ns);
+    if (PyObject_GetBuffer(octets, &self->octets, PyBUF_CONTIG)
+        || PyObject_GetBuffer(control, &self->control, PyBUF_CONTIG)
+        || (senders != Py_None && PyObject_GetBuffer(senders, &self->senders, PyBUF_CONTIG))
+        || describe(self)) {
+        Py_DECREF(self);
+        return NULL;
+    }
+    return (PyObject *)self;
+}
+
+/* Return when message *n* arrived; one without a stamp shortened its header, which is mended. */
+static int64_t arrival_ns(Receiver *self, Py_ssize_t n, int64_t now_ns) {
+    struct msghdr *header = &self->headers[n].msg_hdr;
+    struct timespec stamp;
+    if ((Py_ssize_t)header->msg_controllen != self->control_size) {
+        header->msg_controllen = (size_t)self->control_size;
+        return now_ns;
+    }
+    memcpy(&stamp, (char *)self->control.buf + n * self->control_size + sizeof(struct cmsghdr),
+           sizeof stamp);
+    int64_t at_ns = (int64_t)((uint64_t)stamp.tv_sec * BILLION + (uint64_t)stamp.tv_nsec
+                              + (uint64_t)self->offset_ns);
+    return at_ns > now_ns ? now_ns : at_ns;
+}
+
+/* Hand message *n* to one handler. */
+static int hand_over(Receiver *self, Py_ssize_t n, Py_ssize_t size, int64_t at_ns,
+                     PyObject *handler, PyObject *origin) {
+    const uint8_t *whole = (uint8_t *)self->octets.buf + n * self->buffer_size;
+    PyObject *target = handler;
+    if (Py_IS_TYPE(handler, handler_type)) {
+        const uint8_t *source = self->senders.buf == NULL
+                                    ? whole + 6 : (uint8_t *)self->senders.buf + n * SENDER + 4;
+        Result result = size > self->buffer_size - self->headroom ? LEFT_TO_PYTHON
+                        : take((PortHandler *)handler, whole + self->headroom, size, at_ns, source,
+                               self->senders.buf == NULL ? 6 : 4);
+        if (result != LEFT_TO_PYTHON)
+            return result == FAILED ? -1 : 0;
+        target = ((PortHandler *)handler)->fallback;
+        if (target == NULL)  /* the port was released */
+            return 0;
+    }
+    Py_INCREF(target);
+    PyObject *done = PyObject_CallFunction(target, "OnLO", PyList_GetItem(self->views, n), size,
+                                           (long long)at_ns, origin);
+    Py_DECREF(target);
+    Py_XDECREF(done);
+    return done == NULL ? -1 : 0;
+}
+
+/* Return the handlers of a frame of Ethernet by *routes*, borrowed; NULL if there are none. */
+static PyObject *handlers_for(Receiver *self, PyObject *routes, Py_ssize_t n) {
+    uint64_t head, mask = 0;
+    uint16_t tag;
+    memset(&mask, 0xFF, 6);
+    memcpy(&head, (char *)self->octets.buf + n * self->buffer_size, sizeof head);
+    memcpy(&tag, (char *)self->control.buf + n * self->control_size + 64, sizeof tag);
+    PyObject *vlan = PyLong_FromLong(tag & 0x0FFF);
+    if (vlan == NULL)
+        return NULL;
+    PyObject *found = PyDict_GetItemWithError(routes, vlan);
+    Py_DECREF(vlan);
+    if (found == NULL || !PyDict_Check(found))
+        return NULL;
+    PyObject *address = PyLong_FromUnsignedLongLong(head & mask);
+    if (address == NULL)
+        return NULL;
+    found = PyDict_GetItemWithError(found, address);
+    Py_DECREF(address);
+    return found;
+}
+
+/* Hand a batch over; return how many messages had a handler, -1 for an error. */
+static Py_ssize_t hand_over_batch(Receiver *self, Py_ssize_t count, PyObject *handlers,
+                                  PyObject *unrouted, PyObject *origin) {
+    int64_t now_ns = read_clocks(self);
+    Py_ssize_t taken = 0;
+    for (Py_ssize_t n = 0; n < count; n++) {
+        int64_t at_ns = arrival_ns(self, n, now_ns);
+        PyObject *list = handlers;
+        if (unrouted != Py_None && (list = handlers_for(self, handlers, n)) == NULL) {
+            if (PyErr_Occurred())
+                return -1;
+            PyObject *counted = PyObject_CallFunction(unrouted, "n", n);
+            Py_XDECREF(counted);
+            if (counted == NULL)
+                return -1;
+            continue;
+        }
+        if (!PyList_Check(list)) {
+            refuse("handlers are in a list");
+            return -1;
+        }
+        Py_INCREF(list);  /* a handler may exchange it */
+        int failed = 0;
+        taken += PyList_Size(list) > 0;
+        for (Py_ssize_t i = 0; !failed && i < PyList_Size(list); i++) {
+            PyObject *handler = PyList_GetItem(list, i);
+            Py_INCREF(handler);
+            failed = hand_over(self, n, (Py_ssize_t)self->headers[n].msg_len - self->headroom, at_ns,
+                               handler, origin);
+            Py_DECREF(handler);
+        }
+        Py_DECREF(list);
+        if (failed)
+            return -1;
+    }
+    return taken;
+}
+
+/* drain(fd, handlers, unrouted, origin, note_error): hand all waiting messages over, at most four
+   batches; return how many had a handler.  With *unrouted*, *handlers* has those of each VLAN and
+   address, and *unrouted* gets the position of each other message.  *note_error* gets an errno, and
+   returns whether messages may still wait.  */
+static PyObject *receiver_drain(Receiver *self, PyObject *args) {
+    int fd;
+    PyObject *handlers, *unrouted, *origin, *note;
+    Py_ssize_t total = 0;
+    if (!PyArg_ParseTuple(args, "iOOOO", &fd, &handlers, &unrouted, &origin, &note))
+        return NULL;
+    if (unrouted != Py_None ? !PyDict_Check(handlers) || self->control_size < 66
+                            : !PyList_Check(handlers) || self->senders.buf == NULL)
+        return PyErr_Format(PyExc_TypeError, "a list of handlers, or routes of a packet socket");
+    if (self->busy)
+        return PyErr_Format(PyExc_RuntimeError, "the batch is in use");
+    self->busy = 1;
+    for (int batch = 0; batch < MAX_BATCHES; batch++) {
+        int count = recvmmsg(fd, self->headers, (unsigned)self->count, MSG_DONTWAIT, NULL);
+        if (count < 0 && errno == EAGAIN)
+            break;
+        if (count < 0) {
+            PyObject *again = PyObject_CallFunction(note, "i", errno);
+            int goes_on = again == NULL ? -1 : PyObject_IsTrue(again);
+            Py_XDECREF(again);
+            if (goes_on < 0)
+                goto failed;
+            if (!goes_on)
+                break;
+            continue;
+        }
+        Py_ssize_t taken = hand_over_batch(self, count, handlers, unrouted, origin);
+        if (taken < 0)
+            goto failed;
+        total += taken;
+        if (count == 1 || count < self->count)
+            break;
+    }
+    self->busy = 0;
+    return PyLong_FromSsize_t(total);
+failed:
+    self->busy = 0;
+    return NULL;
+}
+
+static PyMethodDef receiver_methods[] = {
+    {"drain", (PyCFunction)receiver_drain, METH_VARARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+static PyType_Slot receiver_slots[] = {
+    {Py_tp_new, receiver_new}, {Py_tp_dealloc, receiver_dealloc},
+    {Py_tp_methods, receiver_methods}, {0, NULL},
+};
+PyType_Spec receiver_spec = {
+    "eap._cyclic.Receiver", sizeof(Receiver), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_IMMUTABLETYPE,
+    receiver_slots,
+};

@@ -1,0 +1,98 @@
+/* The module eap._cyclic. */
+
+#include "cyclic.h"
+
+#include <stdlib.h>
+
+/* Parameters, plans and offsets as eap/compiled.py gives them; raised when either side changes. */
+#define API 2
+
+PyTypeObject *plan_type, *handler_type;
+static PyTypeObject *receiver_type;
+PyObject *text_fast, *text_source, *text_source_of, *text_wanted;
+
+static const struct {
+    PyType_Spec *spec;
+    PyTypeObject **type;
+} types[] = {
+    {&plan_spec, &plan_type},
+    {&handler_spec, &handler_type},
+    {&receiver_spec, &receiver_type},
+};
+
+static const struct {
+    PyObject **text;
+    const char *value;
+} texts[] = {
+    {&text_fast, "fast"},
+    {&text_source, "source"},
+    {&text_source_of, "source_of"},
+    {&text_wanted, "wanted"},
+};
+
+int refuse(const char *what) {
+    PyErr_SetString(PyExc_ValueError, what);
+    return -1;
+}
+
+int need(int64_t *needed, int64_t first, int64_t count) {
+    if (first < 0 || count < 0 || first > MAX_INDEX || count > MAX_INDEX)
+        return refuse("a plan reaches outside of the image");
+    if (first + count > *needed)
+        *needed = first + count;
+    return 0;
+}
+
+PyObject *make_object(PyTypeObject *type, PyObject *keywords) {
+    if (keywords != NULL && PyDict_Size(keywords))
+        return PyErr_Format(PyExc_TypeError, "there are no keywords");
+    return ((allocfunc)PyType_GetSlot(type, Py_tp_alloc))(type, 0);
+}
+
+void free_object(PyObject *self) {
+    PyTypeObject *type = Py_TYPE(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+void release_buffer(Py_buffer *buffer) {
+    PyBuffer_Release(buffer);
+    memset(buffer, 0, sizeof *buffer);
+}
+
+static int fill(PyObject *module) {
+    for (size_t n = 0; n < sizeof texts / sizeof *texts; n++)
+        if ((*texts[n].text = PyUnicode_InternFromString(texts[n].value)) == NULL)
+            return -1;
+    for (size_t n = 0; n < sizeof types / sizeof *types; n++) {
+        PyObject *type = PyType_FromSpec(types[n].spec);
+        const char *name = strrchr(types[n].spec->name, '.') + 1;
+        if (type == NULL || PyModule_AddObjectRef(module, name, type))
+            return -1;
+        *types[n].type = (PyTypeObject *)type;
+    }
+    PyObject *offsets = Py_BuildValue(
+        "(iiiiiiiiiiiiiii)", STATION_CYCLE, STATION_SEQUENCE, RECEIVED, DUPLICATED, LATE, STATE,
+        LAST_CYCLE, ARRIVED_AT_NS, ARRIVED_IN_CYCLE, BEHIND, JITTER_MAX_US, JITTER, TRACKER_WORDS,
+        CYCLE_AT, FIRST_PD);
+    int failed = offsets == NULL || PyModule_AddObjectRef(module, "OFFSETS", offsets);
+    Py_XDECREF(offsets);
+    return failed ? -1 : PyModule_AddIntConstant(module, "API", API);
+}
+
+static struct PyModuleDef definition = {
+    PyModuleDef_HEAD_INIT, "eap._cyclic", "Compiled part of the cyclic path.", -1,
+    NULL, NULL, NULL, NULL, NULL,
+};
+
+PyMODINIT_FUNC PyInit__cyclic(void) {
+    const char *pure = getenv("EAP_PURE");
+    if (pure != NULL && *pure && strcmp(pure, "0"))
+        return PyErr_Format(PyExc_ImportError, "EAP_PURE is set");
+    PyObject *module = PyModule_Create(&definition);
+    if (module != NULL && fill(module)) {
+        Py_DECREF(module);
+        return NULL;
+    }
+    return module;
+}
