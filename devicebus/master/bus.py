@@ -120,10 +120,15 @@ class MasterSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ChangeCount:
-    """Count of the changes on a bus that users see: states, mailboxes, slaves, faults."""
+    """Count of the changes on a bus that users see: states, mailboxes, slaves, faults.
+
+    Attributes:
+        works: Number of tasks that bring a slave to a state now.
+    """
 
     def __init__(self) -> None:
         self.count = 0
+        self.works = 0
 
     def note(self) -> int:
         """Count a change; return the new count."""
@@ -197,7 +202,13 @@ class BusSlave:
     def start_work(self, work: Task[Any]) -> None:
         """Note the task that brings the slave to a state, and its end."""
         self.work = work
-        work.watch(lambda _: self.note_change())
+        self._changes.works += 1
+        work.watch(self._end_work)
+
+    def _end_work(self, work: Task[Any]) -> None:
+        del work
+        self._changes.works -= 1
+        self.note_change()
 
     @property
     def process_data(self) -> SlaveProcessData:

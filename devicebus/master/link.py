@@ -18,11 +18,20 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import msgspec
 
 from devicebus.errors import FrameLostError
+from devicebus.master.cyclicframe import (
+    FIXED_ADP,
+    MAX_BODY,
+    MAX_DATAGRAMS,
+    CyclicExchange,
+    PreparedFrame,
+    encode_datagrams,
+    encode_header,
+)
 from devicebus.wire.datagram import (
     OVERHEAD,
     Command,
@@ -109,11 +118,6 @@ RETRIES = 4
 LINGER_NS = 1_000_000_000
 """Time after the time-out in which a frame is late; after it the frame is lost."""
 INDEXES = 256
-# Some slaves and masters support no more datagrams in a frame.
-MAX_DATAGRAMS = 15
-"""Datagrams in a frame."""
-MAX_BODY = 1498
-"""Bytes of a frame without its header: the capacity of an Ethernet frame."""
 MAX_DATA = MAX_BODY - OVERHEAD
 """Bytes of one datagram."""
 # A short datagram takes as much time as so many bytes.
@@ -128,12 +132,8 @@ MAX_ACYCLIC_FRAMES = 8
 Done: TypeAlias = Callable[[list[DatagramReply] | FrameLostError, int], None]
 
 _LAYOUT = DatagramHeader.LAYOUT
-_TYPE_WORD = FrameType.DATAGRAM << 12
-_MORE = 0x8000
 _LENGTH = 0x07FF
-_BY_STATION = frozenset((Command.FPRD, Command.FPWR, Command.FPRW, Command.FRMW))
 _BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
-_FIXED_ADP = _BY_STATION | {Command.LRD, Command.LWR, Command.LRW}
 
 
 class LinkStats(msgspec.Struct, frozen=True, kw_only=True):
@@ -165,18 +165,15 @@ class Exchange:
 
     Attributes:
         missing: Number of datagrams without a reply.
-        is_overdue: True if a cyclic frame of it has not come back in time.
     """
 
-    __slots__ = ("cancelled", "done", "is_cyclic", "is_overdue", "missing", "replies")
+    __slots__ = ("cancelled", "done", "missing", "replies")
 
-    def __init__(self, count: int, done: Done, *, is_cyclic: bool) -> None:
+    def __init__(self, count: int, done: Done) -> None:
         self.done = done
-        self.is_cyclic = is_cyclic
         self.missing = count
         self.replies: list[DatagramReply] = [DatagramReply(b"", 0)] * count
         self.cancelled = False
-        self.is_overdue = False
 
     def cancel(self) -> None:
         """Cancel: no datagram is sent any more, and *done* is not called."""
@@ -209,18 +206,30 @@ class _QueuedDatagram:
         return self.is_answered or self.exchange.cancelled
 
 
+class _CyclicPart(NamedTuple):
+    """Frame *number* of a cycle."""
+
+    exchange: CyclicExchange
+    number: int
+    frame: PreparedFrame
+
+
 class _SentFrame:
-    """Frame that is in flight or overdue."""
+    """Frame that is in flight or overdue: *items*, behind its cyclic part if it has one."""
 
     __slots__ = ("cyclic", "deadline_ns", "items", "sent_ns")
 
     def __init__(
-        self, items: list[_QueuedDatagram], sent_ns: int, deadline_ns: int, *, cyclic: bool
+        self,
+        cyclic: _CyclicPart | None,
+        items: Sequence[_QueuedDatagram],
+        sent_ns: int,
+        deadline_ns: int,
     ) -> None:
+        self.cyclic = cyclic
         self.items = items
         self.sent_ns = sent_ns
         self.deadline_ns = deadline_ns
-        self.cyclic = cyclic
 
 
 class Link:
@@ -249,7 +258,7 @@ class Link:
         self._tries = 1 + retries
         self._budget = acyclic_octets
         self._credit: int | None = None  # None while no cycles run
-        self._cyclic: deque[_QueuedDatagram] = deque()
+        self._cyclic: deque[_CyclicPart] = deque()
         self._acyclic: deque[_QueuedDatagram] = deque()
         self._in_flight: dict[int, _SentFrame] = {}
         self._overdue: dict[int, _SentFrame] = {}  # the oldest first
@@ -259,28 +268,32 @@ class Link:
         self._sent = self._received = self._late = self._lost = self._retried = 0
         self._unexpected = self._malformed = 0
 
-    def submit(
-        self, datagrams: Sequence[DatagramRequest], done: Done, *, cyclic: bool = False
-    ) -> Exchange:
-        """Queue datagrams; *done* is called once, with all replies or with an error.
+    def submit(self, datagrams: Sequence[DatagramRequest], done: Done) -> Exchange:
+        """Queue acyclic datagrams; *done* is called once, with all replies or with an error.
 
-        They are sent in order, as many as fit in one frame.  Acyclic datagrams are sent again when
-        their frame is overdue.  Cyclic datagrams are sent once: *done* is called with the replies
-        of a late frame too, and with FrameLostError for a lost frame.
+        They are sent in order, as many as fit in one frame, and again when their frame is overdue.
 
         Raises:
             ValueError: there is no datagram, or one does not fit a frame.
         """
         if not datagrams or max(len(datagram.data) for datagram in datagrams) > MAX_DATA:
             raise ValueError(f"no datagram, or one with more than {MAX_DATA} bytes")
-        exchange = Exchange(len(datagrams), done, is_cyclic=cyclic)
-        queue = self._cyclic if cyclic else self._acyclic
+        exchange = Exchange(len(datagrams), done)
         tries = self._tries
-        queue.extend(
+        self._acyclic.extend(
             _QueuedDatagram(datagram, exchange, number, datagram.tries or tries)
             for number, datagram in enumerate(datagrams)
         )
         return exchange
+
+    def submit_cycle(self, exchange: CyclicExchange) -> None:
+        """Queue the frames of a cycle, which are sent once.
+
+        The exchange takes the reply of a late frame too, and learns of a lost one.
+        """
+        self._cyclic.extend(
+            _CyclicPart(exchange, number, frame) for number, frame in enumerate(exchange.frames)
+        )
 
     def start_cycle(self) -> None:
         """Begin a cycle: refill the budget, less the overdraft of the cycle before."""
@@ -299,9 +312,13 @@ class Link:
         """Return the frames to send now."""
         frames: list[bytes] = []
         while self._cyclic and len(self._in_flight) < self._indexes:
-            self._send(self._cyclic, frames, now_ns, cyclic=True)
+            frames.append(self._send_cyclic(self._cyclic.popleft(), now_ns))
         while self._may_send_acyclic():
-            self._send(self._acyclic, frames, now_ns, cyclic=False)
+            items = self._take(MAX_BODY, MAX_DATAGRAMS)
+            if items:
+                index = self._note_sent(None, items, now_ns)
+                body = encode_datagrams([each.datagram for each in items], index)
+                frames.append(encode_header(len(body)) + body)
         return frames
 
     def receive_frame(self, data: Buffer, now_ns: int) -> None:
@@ -315,7 +332,10 @@ class Link:
             if sent is None:
                 self._unexpected += 1
                 return
-        results = _match(data, index, sent.items)
+        cyclic = sent.cyclic
+        offset = EtherCatHeader.SIZE if cyclic is None else cyclic.frame.size
+        is_ours = cyclic is None or cyclic.frame.matches(data, index)
+        results = _match(data, index, sent.items, offset) if is_ours else None
         if results is None:
             self._malformed += 1
             return
@@ -327,6 +347,8 @@ class Link:
             self._end_flight(index)
         # Karn's rule is not needed: each transmission has its own index (see RoundTrip).
         self._round_trip.measure(now_ns - sent.sent_ns)
+        if cyclic is not None:
+            cyclic.exchange.take(cyclic.number, bytes(data), now_ns)
         for item, (reply, wkc) in zip(sent.items, results, strict=True):
             if item.is_over:
                 continue
@@ -357,12 +379,12 @@ class Link:
         again: list[_QueuedDatagram] = []
         for index in due:
             sent = self._overdue[index] = self._end_flight(index)
+            if sent.cyclic is not None:
+                sent.cyclic.exchange.is_overdue = True
             for item in sent.items:
                 if item.is_over:
                     continue
-                if item.exchange.is_cyclic:
-                    item.exchange.is_overdue = True
-                elif item.tries < item.limit:
+                if item.tries < item.limit:
                     again.append(item)
                 else:
                     item.exchange.fail(_lost(item), now_ns)
@@ -392,23 +414,34 @@ class Link:
             and len(self._in_flight) < self._indexes
         )
 
-    def _send(
-        self, queue: deque[_QueuedDatagram], frames: list[bytes], now_ns: int, *, cyclic: bool
-    ) -> None:
-        items = self._take(queue, cyclic=cyclic)
+    def _send_cyclic(self, cyclic: _CyclicPart, now_ns: int) -> bytes:
+        """Return a frame of a cycle; its last one takes short acyclic datagrams along."""
+        frame = cyclic.frame
+        items: Sequence[_QueuedDatagram] = ()
+        has_credit = self._credit is not None and self._credit > 0
+        if self._acyclic and has_credit and not self._cyclic:
+            room = min(MAX_BODY + EtherCatHeader.SIZE - frame.size, self._piggyback)
+            items = self._take(room, MAX_DATAGRAMS - len(frame.places))
+        index = self._note_sent(cyclic, items, now_ns)
         if not items:
-            return
+            return frame.encode(index)
+        return frame.encode(index, encode_datagrams([each.datagram for each in items], index))
+
+    def _note_sent(
+        self, cyclic: _CyclicPart | None, items: Sequence[_QueuedDatagram], now_ns: int
+    ) -> int:
+        """Note a frame that is sent now; return its index."""
         index = self._free_index(now_ns)
         timeout_ns = self._round_trip.timeout_ns
-        if not cyclic or len(items) > 1:
+        if items:
             tries, limit = max((item.tries, item.limit) for item in items)
             if tries > 1:
                 self._retried += 1
                 timeout_ns = self._round_trip.timeout_of(tries, limit)
-        self._in_flight[index] = _SentFrame(items, now_ns, now_ns + timeout_ns, cyclic=cyclic)
-        self._acyclic_in_flight += not cyclic
+        self._in_flight[index] = _SentFrame(cyclic, items, now_ns, now_ns + timeout_ns)
+        self._acyclic_in_flight += cyclic is None
         self._sent += 1
-        frames.append(_encode(items, index))
+        return index
 
     def _free_index(self, now_ns: int) -> int:
         """Return a free index; if all are in use, that of the oldest overdue frame."""
@@ -425,29 +458,15 @@ class Link:
         """Count an overdue frame as lost."""
         sent = self._overdue.pop(index)
         self._lost += 1
-        for item in sent.items:
-            if item.exchange.is_cyclic and not item.is_answered:
-                item.exchange.fail(_lost(item), now_ns)
+        if sent.cyclic is not None:
+            sent.cyclic.exchange.lose(now_ns)
 
-    def _take(self, queue: deque[_QueuedDatagram], *, cyclic: bool) -> list[_QueuedDatagram]:
+    def _take(self, max_size: int, count: int) -> list[_QueuedDatagram]:
+        """Return queued datagrams, at most *count* with *max_size* bytes, within the budget."""
         items: list[_QueuedDatagram] = []
-        self._fill(items, queue, MAX_BODY, cyclic=cyclic)
-        if cyclic and not queue and self._credit is not None and self._credit > 0:
-            max_size = MAX_BODY - sum(OVERHEAD + len(item.datagram.data) for item in items)
-            self._fill(items, self._acyclic, min(max_size, self._piggyback), cyclic=False)
-        return items
-
-    def _fill(
-        self,
-        items: list[_QueuedDatagram],
-        queue: deque[_QueuedDatagram],
-        max_size: int,
-        *,
-        cyclic: bool,
-    ) -> None:
-        """Add queued datagrams up to *max_size* bytes."""
+        queue = self._acyclic
         size = 0
-        while queue and len(items) < MAX_DATAGRAMS:
+        while queue and len(items) < count:
             octets = OVERHEAD + len(queue[0].datagram.data)
             if size + octets > max_size:
                 break
@@ -457,42 +476,26 @@ class Link:
             item.tries += 1
             items.append(item)
             size += octets
-            if not cyclic and self._credit is not None:
+            if self._credit is not None:
                 self._spent += octets
                 self._credit -= max(octets, MIN_COST)
                 if self._credit <= 0:
                     break
+        return items
 
     def _end_flight(self, index: int) -> _SentFrame:
         sent = self._in_flight.pop(index)
-        self._acyclic_in_flight -= not sent.cyclic
+        self._acyclic_in_flight -= sent.cyclic is None
         return sent
 
 
-def _encode(items: list[_QueuedDatagram], index: int) -> bytes:
-    parts = [b""]
-    length = 0
-    last = len(items) - 1
-    for number, item in enumerate(items):
-        datagram = item.datagram
-        data = datagram.data
-        word = len(data) | (_MORE if number < last else 0)
-        parts += (
-            _LAYOUT.pack(datagram.command, index, datagram.adp, datagram.ado, word, 0),
-            data,
-            b"\0\0",
-        )
-        length += OVERHEAD + len(data)
-    parts[0] = (length | _TYPE_WORD).to_bytes(2, "little")
-    return b"".join(parts)
-
-
 def _match(
-    data: Buffer, index: int, items: list[_QueuedDatagram]
-) -> list[tuple[bytes, int]] | None:
-    """Return data and working counter of each item, or None if this is not the frame."""
+    data: Buffer, index: int, items: Sequence[_QueuedDatagram], offset: int
+) -> Sequence[tuple[bytes, int]] | None:
+    """Return data and working counter of each item from *offset* on; None if they are others."""
+    if not items:
+        return ()
     results = []
-    offset = EtherCatHeader.SIZE
     need = offset + sum(OVERHEAD + len(item.datagram.data) for item in items)
     if len(data) < need or data[1] >> 4 != FrameType.DATAGRAM:
         return None
@@ -502,7 +505,7 @@ def _match(
         there = _LAYOUT.unpack_from(data, offset)
         same = (command, index, datagram.ado, size) == (*there[:2], there[3], there[4] & _LENGTH)
         # ADP of position and broadcast commands is incremented by every slave on the way.
-        if not same or (command in _FIXED_ADP and datagram.adp != there[2]):
+        if not same or (command in FIXED_ADP and datagram.adp != there[2]):
             return None
         start = offset + DatagramHeader.SIZE
         offset = start + size

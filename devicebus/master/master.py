@@ -119,6 +119,11 @@ class Master:
         return self._bus.lacks_group(slave)
 
     @property
+    def is_busy(self) -> bool:
+        """True while a slave is brought to a state."""
+        return self._bus.changes.works > 0
+
+    @property
     def is_waiting(self) -> bool:
         """True while frames may come back."""
         return self._bus.link.is_waiting
@@ -238,9 +243,9 @@ class Master:
         self.merge_overdue(now_ns)
         self._bus.link.handle_timeout(now_ns)
         self._bus.runner.handle_timeout(now_ns)
-        if now_ns >= self._look_ns and self._has_mailbox():
+        if now_ns >= self._look_ns:
             self._look_ns = now_ns + LOOK_NS
-            if self._look is None or self._look.is_done:
+            if self._has_mailbox() and (self._look is None or self._look.is_done):
                 self._look = self.run(poll_mailboxes(self._bus), now_ns, "looking into mailboxes")
         if now_ns >= self._errors_ns and self._bus.cycle is not None:
             self._errors_ns = now_ns + ERRORS_PERIOD_NS

@@ -48,6 +48,7 @@ class BusMapping:
         self._memory = memory_of(Writer.ENGINE)
         self._memory_of = memory_of
         self._plan: BusPlan | None = None
+        self._bus_inputs = self._bus_outputs = memoryview(b"")
         self._outputs: list[tuple[memoryview, CopyPlan]] = []
 
     @property
@@ -63,26 +64,27 @@ class BusMapping:
         if bus_image is None:
             return
         self._plan = self._planner.plan(bus_image.layout)
+        self._bus_inputs = memoryview(bus_image.inputs)
+        self._bus_outputs = memoryview(bus_image.outputs)
         self._outputs = [
             (self._memory_of(writer), plan) for writer, plan in self._plan.outputs.items()
         ]
 
     def keep_inputs(self) -> None:
         """Fill the inputs of the bus from the image, until its slaves send new ones."""
-        if self._plan is not None and self.bus_image is not None:
-            self._plan.kept.run(self._memory, memoryview(self.bus_image.inputs))
+        if self._plan is not None:
+            self._plan.kept.run(self._memory, self._bus_inputs)
 
     def copy_inputs(self, master: Master) -> None:
         """Copy the inputs of the last exchange and the states of the slaves into the image."""
-        if self._plan is not None and self.bus_image is not None:
-            self._plan.inputs.run(memoryview(self.bus_image.inputs), self._memory)
+        if self._plan is not None:
+            self._plan.inputs.run(self._bus_inputs, self._memory)
         self._states.show(master)
 
     def put_outputs(self) -> None:
         """Copy the outputs out of the image."""
-        if self.bus_image is not None:
-            for memory, plan in self._outputs:
-                plan.run(memory, memoryview(self.bus_image.outputs))
+        for memory, plan in self._outputs:
+            plan.run(memory, self._bus_outputs)
 
 
 class BusPlan(NamedTuple):

@@ -447,6 +447,9 @@ class EngineBus:
             if frame is None:
                 break
             self.master.receive_frame(frame, now_ns, line)
+            # Spares a system call for the usual case of one frame; a ring has its copy, too.
+            if self._second is None and not self.master.is_waiting:
+                break
 
     def _receive_frame(self, port: BusPort) -> bytes | None:
         try:
@@ -473,4 +476,4 @@ class EngineBus:
         """Return whether something is under way that should not wait for the next cycle."""
         if self._is_slow or self._starting is not None or self.tasks:
             return True
-        return any(slave.is_busy for slave in self.master.slaves.values())
+        return self.master.is_busy

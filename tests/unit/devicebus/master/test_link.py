@@ -8,15 +8,19 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from devicebus.errors import FrameLostError
+from devicebus.master.cyclicframe import (
+    MAX_BODY,
+    MAX_DATAGRAMS,
+    CyclicExchange,
+    prepare_frames,
+)
 from devicebus.master.link import (
     BACKOFF_LIMIT_NS,
     CEILING_NS,
     FLOOR_NS,
     INDEXES,
     LINGER_NS,
-    MAX_BODY,
     MAX_DATA,
-    MAX_DATAGRAMS,
     MAX_PIGGYBACK,
     Link,
     RoundTrip,
@@ -65,6 +69,23 @@ def test_round_trip_longer_than_the_limit_is_the_time_out():
 
 
 READ = fprd(1001, 0x130, 6)
+
+
+class CycleSpy(CyclicExchange):
+    """One cycle; *outcomes* are the last frame that came back, and when."""
+
+    def __init__(self, *requests):
+        self.outcomes: list = []
+        super().__init__(prepare_frames(requests), 1, 0, (), self._note)
+
+    def _note(self, exchange, now_ns):
+        self.outcomes.append((exchange.replies[-1], now_ns))
+
+
+def submit_cycle(link, *requests):
+    exchange = CycleSpy(*requests)
+    link.submit_cycle(exchange)
+    return exchange
 
 
 class Client:
@@ -335,11 +356,16 @@ def test_link_sends_cyclic_frames_first_with_short_acyclic_datagrams():
     long = fprd(1001, 0x1000, MAX_PIGGYBACK)
     client.ask(READ, READ, long, READ)
     link.start_cycle()
-    cyclic = replace(logical(Command.LRW, 0x10000, bytes(20)), tries=1)
-    client.ask(cyclic, cyclic=True)
+    cyclic = logical(Command.LRW, 0x10000, bytes(20))
+    exchange = submit_cycle(link, cyclic)
     first, second = link.frames_to_send(0)
     assert accesses_of(first) == [replace(cyclic, tries=0), READ, READ]
     assert accesses_of(second) == [long, READ]
+    link.receive_frame(answer(first, wkc=7), 1)
+    assert exchange.outcomes == [(answer(first, wkc=7), 1)]
+    assert len(client.outcomes) == 0
+    link.receive_frame(answer(second), 2)
+    assert [len(replies) for replies, _ in client.outcomes] == [4]
 
 
 def test_link_adds_no_acyclic_datagram_without_budget_or_space():
@@ -347,10 +373,10 @@ def test_link_adds_no_acyclic_datagram_without_budget_or_space():
     client = Client(link)
     client.ask(READ, READ)
     link.start_cycle()
-    client.ask(logical(Command.LRW, 0x10000, bytes(MAX_DATA)), cyclic=True)
+    submit_cycle(link, logical(Command.LRW, 0x10000, bytes(MAX_DATA)))
     first, second = link.frames_to_send(0)
     assert (len(accesses_of(first)), accesses_of(second)) == (1, [READ])
-    client.ask(logical(Command.LRW, 0x10000, bytes(20)), cyclic=True)
+    submit_cycle(link, logical(Command.LRW, 0x10000, bytes(20)))
     (third,) = link.frames_to_send(1)
     assert len(accesses_of(third)) == 1
 
@@ -360,7 +386,7 @@ def test_link_repeats_acyclic_datagrams_of_an_overdue_cyclic_frame():
     client = Client(link)
     client.ask(READ)
     link.start_cycle()
-    exchange = client.ask(logical(Command.LRW, 0x10000, bytes(20)), cyclic=True)
+    exchange = submit_cycle(link, logical(Command.LRW, 0x10000, bytes(20)))
     link.frames_to_send(0)
     assert not exchange.is_overdue
     link.handle_timeout(BACKOFF_LIMIT_NS)
@@ -368,7 +394,9 @@ def test_link_repeats_acyclic_datagrams_of_an_overdue_cyclic_frame():
     (again,) = link.frames_to_send(BACKOFF_LIMIT_NS)
     assert accesses_of(again) == [READ]
     link.handle_timeout(BACKOFF_LIMIT_NS + LINGER_NS)
-    assert [type(outcome) for outcome, _ in client.outcomes] == [FrameLostError]
+    assert exchange.is_lost
+    assert exchange.outcomes == [(b"", BACKOFF_LIMIT_NS + LINGER_NS)]
+    assert client.outcomes == []
 
 
 def test_link_cycle_sends_its_budget_and_one_datagram_at_most():

@@ -86,7 +86,7 @@ def test_process_data_and_mailboxes_under_loss(seed):
     dice = random.Random(seed)
     line.lose_out = lambda _: dice.random() < 0.02
     line.lose_back = lambda _: dice.random() < 0.02
-    for number in range(20):
+    for number in range(40):
         tasks = [
             master.converse(1001 + n, coe_client.upload(0x1018, 1), line.now_ns) for n in range(4)
         ]
