@@ -297,7 +297,7 @@ def decode_report(data: bytes) -> HopReport:
         for net_id in (report.net_id, report.next_net_id, report.target):
             NetId.parse(net_id or report.net_id)
         _require_printable(report)
-    except (msgspec.DecodeError, UnicodeDecodeError, ValueError) as exc:
+    except (ValueError, RecursionError) as exc:
         raise MalformedError(f"not a report of a hop: {exc}", layout="HopReport") from None
     return report
 

@@ -149,7 +149,7 @@ class BusRequestHandler:
                 return
             try:
                 request = self._decoder.decode(message)
-            except msgspec.MsgspecError as exc:
+            except ValueError as exc:
                 self._refuse(message, exc)
                 continue
             match request:
@@ -165,12 +165,12 @@ class BusRequestHandler:
                 case _:
                     self._serve_bus(request, now_ns)
 
-    def _refuse(self, message: bytes, reason: msgspec.MsgspecError) -> None:
+    def _refuse(self, message: bytes, reason: ValueError) -> None:
         """Count a malformed request, and answer it if it has a number."""
         self.malformed += 1
         try:
             number = msgspec.msgpack.decode(message, type=_Numbered).id
-        except msgspec.MsgspecError:
+        except ValueError:
             return
         error = BusError(f"malformed request: {reason}")
         self._send(EngineReply(id=number, error=to_record(error)))

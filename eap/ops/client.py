@@ -431,7 +431,7 @@ def _label(info: ApplianceInfo) -> str:
 
 def _starting(folder: ApplianceFolder) -> Iterator[str]:
     """Yield the processes of an appliance that are starting or restarting, with their steps."""
-    with suppress(OSError, msgspec.MsgspecError):
+    with suppress(OSError, ValueError):
         info = folder.read_info()
         processes = {"engine": info.engine, "services": info.services, **info.segments}
         for name, process in processes.items():

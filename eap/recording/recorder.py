@@ -421,7 +421,7 @@ class Recorder:
             if not folder.is_alive():
                 raise ImageError("the plant does not run")
             self._attached = Attachment(self._options, folder.read_info())
-        except (EapError, OSError, ValueError, msgspec.MsgspecError) as exc:
+        except (EapError, OSError, ValueError) as exc:
             self.state.state, self.state.reason = "waiting", str(exc)
             return
         self.state.selected = self._attached.selected

@@ -74,7 +74,7 @@ class DraftFile:
             downloads = [msgspec.json.decode(line, type=Download) for line in lines[1:-1]]
         except FileNotFoundError:
             return None
-        except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as exc:
+        except (OSError, ValueError) as exc:
             logger.warning(
                 "station %s: downloads in PREOP cannot be read from %s: %s; the stored"
                 " configuration counts",

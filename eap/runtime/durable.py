@@ -40,7 +40,7 @@ def unseal(data: bytes, version: int) -> bytes:
     """Return the content of a file; raise ConfigError with the reason if it is invalid."""
     try:
         file = msgspec.json.decode(data, type=_File)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as exc:
+    except ValueError as exc:
         raise ConfigError(f"it is not whole: {exc}") from None
     if file.version != version:
         raise ConfigError(f"its version is {file.version}, this release knows {version}")

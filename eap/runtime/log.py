@@ -96,7 +96,8 @@ class LevelFile:
 
     def read(self) -> dict[str, str]:
         """Return the level of each process that has another one than info."""
-        with suppress(OSError, msgspec.DecodeError):
+        # Bytes that are no UTF-8 raise UnicodeDecodeError, which is none of msgspec's errors.
+        with suppress(OSError, ValueError):
             return msgspec.json.decode(self._path.read_bytes(), type=dict[str, str])
         return {}
 

@@ -167,7 +167,7 @@ def load_copy(handover: SegmentHandover) -> BusFile:
     copy, file = Path(handover.copy), Path(handover.file)
     if not handover.copy:
         return load_or_raise(file)
-    with suppress(OSError, msgspec.MsgspecError):
+    with suppress(OSError, ValueError):
         return msgspec.msgpack.decode(copy.read_bytes(), type=BusFile)
     bus = load_or_raise(file)
     if bus.digest() != handover.digest:

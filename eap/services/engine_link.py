@@ -152,7 +152,7 @@ class EngineLink:
     def _handle(self, data: bytes) -> None:
         try:
             message = self._decoder.decode(data)
-        except msgspec.MsgspecError as exc:
+        except ValueError as exc:
             logger.warning("message of the engine dropped: %s", exc)
             return
         self.received_s = self._loop.time()

@@ -131,7 +131,7 @@ class Log(Closeable):
             return text
         try:
             line = _DECODER.decode(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             # Not by logging, such as the reason of a start that fails.
             line = LogLine(_now(), "error", process, process, text.removeprefix(f"{process}: "))
         self.write(line)

@@ -331,5 +331,5 @@ async def read_json(request: web.Request) -> object:
     try:
         # json.loads() takes NaN, and half of a surrogate pair, which no text can have.
         return msgspec.json.decode(body)
-    except (msgspec.MsgspecError, ValueError, RecursionError):
+    except (ValueError, RecursionError):
         raise web.HTTPBadRequest(reason="the body is not JSON") from None

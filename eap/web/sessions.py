@@ -57,7 +57,7 @@ class Sessions:
         try:
             body = urlsafe_b64decode(encoded)
             session = msgspec.json.decode(body, type=_PageSession)
-        except (ValueError, msgspec.MsgspecError):
+        except ValueError:
             return None
         user = self._users.get(session.user)
         # Another encoding of the same body would be another token, which could not be ended.

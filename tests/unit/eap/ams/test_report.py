@@ -229,6 +229,8 @@ def test_reports_survive_the_wire() -> None:
         b'{"station": "x", "net_id": "1.2"}',
         b'{"station": 5}',
         b'{"station": "\\u001b[2J", "net_id": "1.2.3.4.5.6"}',
+        b'{"station": "\xff"}',
+        b'{"later": ' + b"[" * 1500,
     ],
 )
 def test_hop_report_refuses_malformed_data(data: bytes) -> None:

@@ -302,7 +302,7 @@ def test_slaves_stay_those_that_were_applied(tmp_path, capsys):
     assert slaves(digest) == ["first"]
     file.write_text("bus: b\nslaves: [{name: second, kind: coupler}]\n")
     assert slaves(digest) == ["first"]
-    copy.write_bytes(b"damaged")
+    copy.write_bytes(copy.read_bytes().replace(b"first", b"f\xff\xff\xff\xff"))
     assert slaves(digest) == ["second"]
     assert "has changed since it was applied" in capsys.readouterr().err
     assert load_copy(SegmentHandover(1, str(file), "", "", 5, 6)) == load_or_raise(file)

@@ -53,8 +53,10 @@ def test_json_has_an_object_a_line_whatever_a_process_wrote(pipe):
     assert log.pass_on("services", encoded(LINE)) == "services: hop down"
     assert log.pass_on("engine", "engine: no such interface") == "engine: no such interface"
     assert log.pass_on("engine", '{"half') == 'engine: {"half'
+    nested = '{"later": ' + "[" * 2000
+    assert log.pass_on("engine", nested) == f"engine: {nested}"
     log.write(LINE)
-    first, second, third, fourth = map(json.loads, written(pipe[0]).splitlines())
+    first, second, third, _, fourth = map(json.loads, written(pipe[0]).splitlines())
     assert first == fourth == {
         "time": "2026-11-23T09:00:00.000+00:00",
         "level": "warning",

@@ -58,6 +58,14 @@ def test_wrong_log_level_is_refused(call, params, reason):
         call("set_log_level", **params)
 
 
+@pytest.mark.parametrize("content", [b"", b"{", b'{"web": "\xff"}', b'{"web": 5}'])
+def test_damaged_file_of_log_levels_is_as_none(tmp_path, content):
+    (tmp_path / "log.levels").write_bytes(content)
+    levels = LevelFile(tmp_path)
+    assert levels.read() == {}
+    levels.follow("web")
+
+
 def test_log_level_of_an_optional_process_is_followed_by_it_alone(call, tmp_path):
     mqtt, logger = LevelFile(tmp_path), logging.getLogger("eap")
     mqtt.follow("mqtt")
