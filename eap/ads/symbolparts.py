@@ -13,8 +13,8 @@ from itertools import accumulate
 from typing import NamedTuple
 
 from eap.codec.basetypes import Text
-from eap.codec.datatypes import Array, DataType
-from eap.codec.structures import PATH_STEP, Structure
+from eap.codec.datatypes import PATH_STEP, Array, DataType
+from eap.codec.structures import Structure
 
 
 class SymbolPart(NamedTuple):

@@ -39,8 +39,8 @@ from eap.codec.adssymbol import (
     encode_entry,
     encode_text,
 )
-from eap.codec.datatypes import DataType
-from eap.codec.structures import MAX_DEPTH, split_paths
+from eap.codec.datatypes import DataType, split_paths
+from eap.codec.structures import MAX_DEPTH
 
 _INDEX_BITS = 24
 _MAX_PARTS = 4096

@@ -14,7 +14,7 @@ from time import time_ns
 from typing import Any, NamedTuple
 
 from eap.codec import datatypes
-from eap.codec.structures import find_variable
+from eap.codec.datatypes import find_variable
 from eap.config.selection import match_names
 from eap.control.protocol import (
     HELLO,

@@ -10,16 +10,14 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import CommandGroup, LazyGroup
-from eap.cli.output import Renderer
+from eap.cli.output import CommandT, Renderer, json_option
 from eap.cli.params import (
     BusAddress,
     BusCommand,
-    CommandT,
     StationBus,
     bus_options,
     check_new_file,
     examples,
-    json_option,
     number_up_to,
     open_session,
     parse_entry,

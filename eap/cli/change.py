@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Renderer, write_text
-from eap.cli.params import PLANT_FILE, CommandT, json_option
+from eap.cli.output import CommandT, Renderer, json_option, write_text
+from eap.cli.params import PLANT_FILE
 from eap.errors import ControlError
 from eap.ids import ObjectId
 from eap.quantities import count

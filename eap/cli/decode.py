@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Renderer
-from eap.cli.params import json_option
+from eap.cli.output import Renderer, json_option
 
 if TYPE_CHECKING:
     from rich.tree import Tree

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Renderer, repaint, write_view
-from eap.cli.params import PLANT_FILE, check_new_file, examples, json_option
+from eap.cli.output import Renderer, json_option, repaint, write_view
+from eap.cli.params import PLANT_FILE, check_new_file, examples
 from eap.errors import CodecError, ConfigError, ControlError, EnvironmentalError
 from eap.ids import NetId
 from eap.quantities import count

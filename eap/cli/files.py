@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Column, Renderer, TextTable, write_text
-from eap.cli.params import PLANT_FILE, examples, json_option, parse_cycle
+from eap.cli.output import Column, Renderer, TextTable, json_option, write_text
+from eap.cli.params import PLANT_FILE, examples, parse_cycle
 from eap.quantities import count
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import click
 
 from eap.cli.completion import complete_target
 from eap.cli.group import CommandGroup, LazyGroup
-from eap.cli.output import Column, Renderer, TextTable
+from eap.cli.output import Column, Renderer, TextTable, json_option
 from eap.cli.params import (
     BusAddress,
     BusCommand,
@@ -22,7 +22,6 @@ from eap.cli.params import (
     bus_options,
     bus_parameters,
     examples,
-    json_option,
     open_session,
     plant_option,
 )

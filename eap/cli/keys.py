@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 from eap.cli.group import CommandGroup
-from eap.cli.output import Column, Renderer, TextTable
-from eap.cli.params import examples, json_option
+from eap.cli.output import Column, Renderer, TextTable, json_option
+from eap.cli.params import examples
 
 if TYPE_CHECKING:
     from eap.ops.pd_keys import KeyInfo

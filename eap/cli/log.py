@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.output import Renderer, TextTable
-from eap.cli.params import examples, json_option, plant_option
+from eap.cli.output import Renderer, TextTable, json_option
+from eap.cli.params import examples, plant_option
 
 if TYPE_CHECKING:
     from eap.control.log import LogLevels

@@ -9,8 +9,8 @@ import click
 
 from eap.cli.completion import complete_target
 from eap.cli.group import ExitCode
-from eap.cli.output import Column, Renderer, Styled, TextTable
-from eap.cli.params import examples, json_option, plant_option
+from eap.cli.output import Column, Renderer, Styled, TextTable, json_option
+from eap.cli.params import examples, plant_option
 from eap.quantities import count, duration
 
 if TYPE_CHECKING:

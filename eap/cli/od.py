@@ -11,8 +11,8 @@ import click
 
 from eap.cli.completion import complete_target
 from eap.cli.group import CommandGroup, ExitCode
-from eap.cli.output import Renderer, TextTable
-from eap.cli.params import json_option, parse_entry, parse_octets, parse_type, plant_option
+from eap.cli.output import Renderer, TextTable, json_option
+from eap.cli.params import parse_entry, parse_octets, parse_type, plant_option
 from eap.errors import ControlError
 
 if TYPE_CHECKING:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 
+CommandT = TypeVar("CommandT", bound=Callable[..., Any])
 ResultT = TypeVar("ResultT")
 View: TypeAlias = "str | Iterable[RenderableType]"
 """One line, or lines and tables from top to bottom."""
@@ -69,6 +70,20 @@ class Renderer:
         """Print a line on stderr that is in the JSON result already."""
         if not self.is_json:
             click.echo(text, err=True)
+
+
+def json_option(text: str) -> Callable[[CommandT], CommandT]:
+    """Return the decorator that adds ``--json``; the function gets *output*.
+
+    Args:
+        text: Help text: the form of the JSON result.
+    """
+    return click.option("--json", "output", is_flag=True, callback=_to_output, help=text)
+
+
+def _to_output(ctx: click.Context, param: click.Parameter, is_json: bool) -> Renderer:
+    del ctx, param
+    return Renderer(is_json=is_json)
 
 
 def write_json(document: Any) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import click
 
 from eap.cli.completion import complete_bus, complete_plant, complete_station
-from eap.cli.output import Renderer
+from eap.cli.output import CommandT
 from eap.errors import ConfigError
 from eap.ids import InterfaceUri, ObjectId
 
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from eap.codec.datatypes import DataType
     from eap.ops.bus_session import SlaveBus
 
-
-CommandT = TypeVar("CommandT", bound=Callable[..., Any])
 
 MIN_CYCLE_US = 100
 MAX_CYCLE_US = 60_000_000
@@ -29,30 +27,6 @@ ANSWER_MARGIN_S = 5.0
 
 PLANT_FILE = click.Path(path_type=Path)
 """Path of a plant file; the loader reports why it cannot be read."""
-
-
-class VariableName(NamedTuple):
-    """A variable of a station, written ``STATION/NAME``."""
-
-    station: str
-    name: str
-
-    def __str__(self) -> str:
-        return f"{self.station}/{self.name}"
-
-
-def json_option(text: str) -> Callable[[CommandT], CommandT]:
-    """Return the decorator that adds ``--json``; the function gets *output*.
-
-    Args:
-        text: Help text: the form of the JSON result.
-    """
-    return click.option("--json", "output", is_flag=True, callback=_to_output, help=text)
-
-
-def _to_output(ctx: click.Context, param: click.Parameter, is_json: bool) -> Renderer:
-    del ctx, param
-    return Renderer(is_json=is_json)
 
 
 def plant_option(command: CommandT) -> CommandT:
@@ -70,43 +44,6 @@ def station_option(command: CommandT) -> CommandT:
     return click.option(
         "--station", metavar="NAME", help="Only this station.", shell_complete=complete_station
     )(command)
-
-
-def parse_names(words: tuple[str, ...]) -> dict[str, list[str]]:
-    """Read ``STATION [VAR…]`` or ``STATION/VAR…``, and return the variables of each station.
-
-    No variables means all of the station's.
-
-    Raises:
-        click.UsageError: a name has no station.
-    """
-    names: dict[str, list[str]] = {}
-    current = ""
-    for word in words:
-        station, slash, name = word.partition("/")
-        if slash:
-            if not station or not name:
-                raise click.UsageError(f"{word!r} is not a variable (STATION/NAME)")
-            names.setdefault(station, []).append(name)
-        elif current:
-            names[current].append(word)
-        elif names:
-            raise click.UsageError(f"{word!r} has no station: write STATION/{word}")
-        else:
-            current = word
-            names[current] = []
-    return names
-
-
-def parse_assignment(words: tuple[str, ...]) -> tuple[VariableName, str]:
-    """Read ``STATION VAR VALUE`` or ``STATION/VAR VALUE``; raise click.UsageError otherwise."""
-    if len(words) == 3 and "/" not in words[0]:
-        return VariableName(words[0], words[1]), words[2]
-    if len(words) == 2:
-        station, _, name = words[0].partition("/")
-        if station and name:
-            return VariableName(station, name), words[1]
-    raise click.UsageError("expected STATION VAR VALUE (or STATION/VAR VALUE)")
 
 
 def parse_cycle(ctx: click.Context, param: click.Parameter, text: str | None) -> int | None:

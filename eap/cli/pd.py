@@ -5,24 +5,65 @@ from __future__ import annotations
 from contextlib import ExitStack
 from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
 from eap.cli.completion import complete_variables
 from eap.cli.group import CommandGroup
-from eap.cli.output import Renderer, value_text
-from eap.cli.params import (
-    json_option,
-    parse_assignment,
-    parse_names,
-    plant_option,
-    station_option,
-)
+from eap.cli.output import Renderer, json_option, value_text
+from eap.cli.params import plant_option, station_option
 
 if TYPE_CHECKING:
     from eap.cli.pd_view import ListedPd
     from eap.ops.client import ControlClient
+
+
+class VariableName(NamedTuple):
+    """A variable of a station, written ``STATION/NAME``."""
+
+    station: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.station}/{self.name}"
+
+
+def parse_names(words: tuple[str, ...]) -> dict[str, list[str]]:
+    """Read ``STATION [VAR…]`` or ``STATION/VAR…``, and return the variables of each station.
+
+    No variables means all of the station's.
+
+    Raises:
+        click.UsageError: a name has no station.
+    """
+    names: dict[str, list[str]] = {}
+    current = ""
+    for word in words:
+        station, slash, name = word.partition("/")
+        if slash:
+            if not station or not name:
+                raise click.UsageError(f"{word!r} is not a variable (STATION/NAME)")
+            names.setdefault(station, []).append(name)
+        elif current:
+            names[current].append(word)
+        elif names:
+            raise click.UsageError(f"{word!r} has no station: write STATION/{word}")
+        else:
+            current = word
+            names[current] = []
+    return names
+
+
+def parse_assignment(words: tuple[str, ...]) -> tuple[VariableName, str]:
+    """Read ``STATION VAR VALUE`` or ``STATION/VAR VALUE``; raise click.UsageError otherwise."""
+    if len(words) == 3 and "/" not in words[0]:
+        return VariableName(words[0], words[1]), words[2]
+    if len(words) == 2:
+        station, _, name = words[0].partition("/")
+        if station and name:
+            return VariableName(station, name), words[1]
+    raise click.UsageError("expected STATION VAR VALUE (or STATION/VAR VALUE)")
 
 
 @click.group(cls=CommandGroup)

@@ -23,8 +23,8 @@ from eap.cli.output import (
     offset_text,
     value_text,
 )
-from eap.codec.datatypes import parse
-from eap.codec.structures import member_type_name, parts_of
+from eap.codec.datatypes import parse, parts_of
+from eap.codec.structures import member_type_name
 from eap.control.protocol import ValuesEvent, VariableRow
 from eap.errors import EapError
 from eap.ops.client import connect_station

@@ -10,8 +10,8 @@ import click
 from click.core import ParameterSource
 
 from eap.cli.group import ExitCode
-from eap.cli.output import Renderer, write_text
-from eap.cli.params import PLANT_FILE, CommandT, check_new_file, json_option, parse_cycle
+from eap.cli.output import CommandT, Renderer, json_option, write_text
+from eap.cli.params import PLANT_FILE, check_new_file, parse_cycle
 from eap.errors import ConfigError
 from eap.quantities import count
 

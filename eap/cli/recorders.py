@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eap.cli.completion import complete_variables
-from eap.cli.output import Column, Renderer, TextTable
-from eap.cli.params import examples, json_option, plant_option
+from eap.cli.output import Column, Renderer, TextTable, json_option
+from eap.cli.params import examples, plant_option
 from eap.quantities import age, count, size
 
 if TYPE_CHECKING:

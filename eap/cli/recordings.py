@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.output import Column, Renderer, TextTable, write_text
-from eap.cli.params import PLANT_FILE, examples, json_option
+from eap.cli.output import Column, Renderer, TextTable, json_option, write_text
+from eap.cli.params import PLANT_FILE, examples
 from eap.quantities import count, size
 
 if TYPE_CHECKING:

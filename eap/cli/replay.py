@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.output import Column, Renderer, TextTable
-from eap.cli.params import PLANT_FILE, examples, json_option
+from eap.cli.output import Column, Renderer, TextTable, json_option
+from eap.cli.params import PLANT_FILE, examples
 from eap.quantities import count, duration
 
 if TYPE_CHECKING:

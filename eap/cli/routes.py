@@ -10,8 +10,8 @@ import click
 
 from eap.cli.completion import complete_station
 from eap.cli.group import ExitCode, LazyGroup
-from eap.cli.output import Renderer, write_text
-from eap.cli.params import ANSWER_MARGIN_S, examples, json_option, plant_option
+from eap.cli.output import Renderer, json_option, write_text
+from eap.cli.params import ANSWER_MARGIN_S, examples, plant_option
 from eap.errors import ControlError
 
 if TYPE_CHECKING:

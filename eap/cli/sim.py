@@ -10,8 +10,8 @@ import click
 
 from eap.cli.completion import complete_bus
 from eap.cli.group import LazyGroup
-from eap.cli.output import Renderer, write_json
-from eap.cli.params import CommandT, StationBus, examples, json_option, parse_port, plant_option
+from eap.cli.output import CommandT, Renderer, json_option, write_json
+from eap.cli.params import StationBus, examples, parse_port, plant_option
 from eap.ids import InterfaceUri
 
 _EXAMPLE = "such as power slave=drive for_ms=500"

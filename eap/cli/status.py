@@ -23,10 +23,11 @@ from eap.cli.output import (
     Renderer,
     Styled,
     TextTable,
+    json_option,
     repaint,
     write_json,
 )
-from eap.cli.params import json_option, plant_option, station_option
+from eap.cli.params import plant_option, station_option
 from eap.errors import ControlError
 from eap.live.findings import (
     LISTENER_COUNTS,

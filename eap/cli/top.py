@@ -16,8 +16,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eap.cli.output import Column, Renderer, Styled, TextTable, repaint, write_json, write_view
-from eap.cli.params import examples, json_option, plant_option
+from eap.cli.output import (
+    Column,
+    Renderer,
+    Styled,
+    TextTable,
+    json_option,
+    repaint,
+    write_json,
+    write_view,
+)
+from eap.cli.params import examples, plant_option
 from eap.errors import ControlError, EnvironmentalError
 
 if TYPE_CHECKING:

@@ -13,9 +13,10 @@ from eap.cli.output import (
     Renderer,
     Styled,
     TextTable,
+    json_option,
     offset_text,
 )
-from eap.cli.params import PLANT_FILE, examples, json_option
+from eap.cli.params import PLANT_FILE, examples
 from eap.quantities import count
 
 if TYPE_CHECKING:

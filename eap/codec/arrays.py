@@ -12,13 +12,9 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-from eap.codec.basetypes import DataType, Integer, Plain, Real, Value
+from eap.codec.basetypes import DataType, Integer, Plain, Real, Value, check_size
 from eap.codec.literals import Literal, read_literal
 from eap.codec.wire import Buffer
-
-# A PD's length is 16 bits wide.
-MAX_SIZE = 0xFFFF
-"""Bytes of the largest variable."""
 
 
 class Dimension(NamedTuple):
@@ -213,9 +209,3 @@ def make_array(text: str, element: DataType, dimensions: Sequence[Dimension]) ->
         element=element,
         dimensions=tuple(dimensions),
     )
-
-
-def check_size(text: str, size: int) -> None:
-    """Raise ValueError, which begins with *text*, if no variable can have *size* bytes."""
-    if not 0 < size <= MAX_SIZE:
-        raise ValueError(f"{text!r} has {size} bytes: expected 1 to {MAX_SIZE}")

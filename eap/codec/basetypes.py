@@ -23,6 +23,10 @@ Plain: TypeAlias = bool | int | float | str | list[Any] | dict[str, Any]
 """A value as YAML and JSON carry it: bytes are hexadecimal digits, times and enums texts."""
 
 
+# A PD's length is 16 bits wide.
+MAX_SIZE = 0xFFFF
+"""Bytes of the largest variable."""
+
 _SHOWN = 60
 """Characters of a refused value in a message."""
 
@@ -152,6 +156,12 @@ class DataType(msgspec.Struct, frozen=True, eq=False):
         if len(shown) > _SHOWN:
             shown = f"{shown[:_SHOWN]}…"
         return ValueError(f"{shown} is not a value of {self.name}: expected {expected}")
+
+
+def check_size(text: str, size: int) -> None:
+    """Raise ValueError, which begins with *text*, if no variable can have *size* bytes."""
+    if not 0 < size <= MAX_SIZE:
+        raise ValueError(f"{text!r} has {size} bytes: expected 1 to {MAX_SIZE}")
 
 
 def whole_number(text: str) -> int:

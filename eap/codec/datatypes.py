@@ -1,23 +1,24 @@
-"""Data types of process variables by their texts (ETG.1020, IEC 61131-3), and their layout in a PD.
+"""Data types of process variables by their texts, their layout in a PD, and paths to their parts.
 
-Names are those of ESI files and IEC 61131-3; the shorter and the CANopen names are read as well.
-:func:`parse` returns the type for a text, which is complete: a struct's has all its members, so
-that a type passes between processes and files as its text.  :mod:`eap.codec.structures` describes
-the texts of structs and enumerations.
+Names are those of ETG.1020, ESI files and IEC 61131-3; the shorter and the CANopen names are read
+as well.  :func:`parse` returns the type for a text, which is complete: a struct's has all its
+members, so that a type passes between processes and files as its text.
+:mod:`eap.codec.structures` describes the texts of structs and enumerations.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Iterator
 from functools import lru_cache
 from math import isfinite, nan
 from typing import Any, NamedTuple, NoReturn, Protocol
 
 import msgspec
 
-from eap.codec.arrays import MAX_SIZE, Array, Dimension, check_size, make_array
+from eap.codec.arrays import Array, Dimension, make_array
 from eap.codec.basetypes import (
+    MAX_SIZE,
     Block,
     Boolean,
     DataType,
@@ -28,11 +29,12 @@ from eap.codec.basetypes import (
     Value,
     WideChar,
     WideString,
+    check_size,
 )
 from eap.codec.enumerations import MAX_MEMBERS, make_enumeration
-from eap.codec.structures import MAX_DEPTH, Member, make_structure
+from eap.codec.structures import MAX_DEPTH, Member, Structure, make_structure
 from eap.codec.times import TIMES
-from eap.suggest import nearest_in_any_case
+from eap.suggest import nearest_in_any_case, suggest
 
 # Users of types import all of them from here.
 __all__ = [
@@ -463,3 +465,128 @@ def with_nan(plain: Any) -> Any:
 
 def _whole_octet(bits: int) -> int:
     return (bits + 7) // 8 * 8
+
+
+PATH_STEP = re.compile(r"\.([A-Za-z_]\w*)|\[\s*(-?\d{1,6}(?:\s*,\s*-?\d{1,6})*)\s*\]", re.ASCII)
+"""One step of a path: a member, or the indexes of an element."""
+_DELIMITERS = re.compile(r"[.\[]")
+
+
+class Part(NamedTuple):
+    """A member or element of a variable; *bit_offset* counts from the start of the variable."""
+
+    kind: DataType
+    bit_offset: int
+
+
+@lru_cache(maxsize=4096)
+def find_part(kind: DataType, path: str) -> Part:
+    """Return the part of *kind* at *path*, such as ``.axes[2].position``.
+
+    Raises:
+        ValueError: there is none; the message says where the path ends.
+    """
+    bit_offset, at = 0, 0
+    while at < len(path):
+        step = PATH_STEP.match(path, at)
+        if step is None:
+            raise ValueError(f"{path[at:][:60]!r} is no path such as .member or [1]")
+        where = path[:at] or "it"
+        if step[1] is not None:
+            if not isinstance(kind, Structure):
+                raise ValueError(f"{where} is {kind.name} and has no members{_element_hint(kind)}")
+            member = kind.by_name.get(step[1])
+            if member is None:
+                known = ", ".join(each.name for each in kind.members[:8])
+                hint = suggest(step[1], kind.by_name) or f"; members: {known}"
+                raise ValueError(f"{kind.name} has no member {step[1]!r}{hint}")
+            kind, bit_offset = member.kind, bit_offset + member.bit_offset
+        else:
+            if not isinstance(kind, Array):
+                raise ValueError(f"{where} is {kind.name} and has no elements")
+            number = kind.index_of([int(each) for each in step[2].split(",")])
+            bit_offset += 8 * number * kind.element.size
+            kind = kind.element
+        at = step.end()
+    return Part(kind, bit_offset)
+
+
+def _element_hint(kind: DataType) -> str:
+    if not isinstance(kind, Array):
+        return ""
+    first = ",".join(str(low) for low, _ in kind.dimensions)
+    return f": expected an element of it before, such as [{first}]"
+
+
+def split_paths(name: str) -> Iterator[tuple[str, str]]:
+    """Yield each way to divide *name* into a variable and a path, the longest variable first."""
+    # Names of variables have dots of their own: bus0.axis.csp.Target.
+    for match in reversed(list(_DELIMITERS.finditer(name))):
+        if match.start():
+            yield name[: match.start()], name[match.start() :]
+
+
+def variable_of(name: str, known: Container[str]) -> str:
+    """Return the one of *known* variables that *name* is or lies in, else *name* itself."""
+    if name in known:
+        return name
+    return next((variable for variable, _ in split_paths(name) if variable in known), name)
+
+
+def find_variable(name: str, type_of: Callable[[str], DataType | None]) -> tuple[str, Part] | None:
+    """Return the variable that *name* is or lies in, and the part; None if there is none.
+
+    Args:
+        name: A variable, or a variable and a path into it; a variable of that name goes first.
+        type_of: Returns the type of a variable, None if there is none.
+
+    Raises:
+        ValueError: the variable has no such part.
+    """
+    kind = type_of(name)
+    if kind is not None:
+        return name, Part(kind, 0)
+    for variable, path in split_paths(name):
+        kind = type_of(variable)
+        if kind is not None:
+            return variable, find_part(kind, path)
+    return None
+
+
+class SharedPart(NamedTuple):
+    """A part that two types have in common, with its place in each of them."""
+
+    old_bit: int
+    new_bit: int
+    bits: int
+
+
+def shared_parts(old: DataType, new: DataType) -> Iterator[SharedPart]:
+    """Yield what both types have: all if they are equal, else members of one name and type."""
+    if old == new:
+        yield SharedPart(0, 0, new.bit_length)
+    elif (
+        isinstance(old, Structure)
+        and isinstance(new, Structure)
+        # In a union the copy of one member would overwrite that of another.
+        and not (old.is_union or new.is_union)
+    ):
+        for member in new.members:
+            if (was := old.by_name.get(member.name)) is None:
+                continue
+            for old_bit, new_bit, bits in shared_parts(was.kind, member.kind):
+                yield SharedPart(was.bit_offset + old_bit, member.bit_offset + new_bit, bits)
+
+
+def parts_of(kind: DataType, path: str = "") -> Iterator[tuple[str, Part]]:
+    """Yield the members of *kind*, those of nested structs too, with their paths.
+
+    An array is one part; its elements are not listed.
+    """
+    if not isinstance(kind, Structure):
+        return
+    for member in kind.members:
+        own = f"{path}.{member.name}"
+        yield own, Part(member.kind, member.bit_offset)
+        for inner, part in parts_of(member.kind, own):
+            yield inner, Part(part.kind, member.bit_offset + part.bit_offset)

@@ -1,4 +1,4 @@
-"""Structs and unions, their layout, and paths to members and elements.
+"""Structs and unions, and their layout.
 
 A struct is laid out as compilers of IEC 61131-3 and C do: a member starts at a multiple of its
 alignment, limited by the packing, and the size is a multiple of the largest alignment.  The text of
@@ -10,13 +10,10 @@ for bit 5 of byte 3.  A definition that occurs again in the same text is its nam
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from eap.codec.arrays import Array, check_size
-from eap.codec.basetypes import Boolean, DataType, Plain, Value
+from eap.codec.basetypes import Boolean, DataType, Plain, Value, check_size
 from eap.codec.enumerations import MAX_MEMBERS, check_name
 from eap.codec.literals import Literal, read_literal
 from eap.codec.wire import Buffer
@@ -371,131 +368,6 @@ def _is_off(member: Member, align: int) -> bool:
     )
 
 
-PATH_STEP = re.compile(r"\.([A-Za-z_]\w*)|\[\s*(-?\d{1,6}(?:\s*,\s*-?\d{1,6})*)\s*\]", re.ASCII)
-"""One step of a path: a member, or the indexes of an element."""
-_DELIMITERS = re.compile(r"[.\[]")
-
-
-class Part(NamedTuple):
-    """A member or element of a variable; *bit_offset* counts from the start of the variable."""
-
-    kind: DataType
-    bit_offset: int
-
-
-@lru_cache(maxsize=4096)
-def find_part(kind: DataType, path: str) -> Part:
-    """Return the part of *kind* at *path*, such as ``.axes[2].position``.
-
-    Raises:
-        ValueError: there is none; the message says where the path ends.
-    """
-    bit_offset, at = 0, 0
-    while at < len(path):
-        step = PATH_STEP.match(path, at)
-        if step is None:
-            raise ValueError(f"{path[at:][:60]!r} is no path such as .member or [1]")
-        where = path[:at] or "it"
-        if step[1] is not None:
-            if not isinstance(kind, Structure):
-                raise ValueError(f"{where} is {kind.name} and has no members{_element_hint(kind)}")
-            member = kind.by_name.get(step[1])
-            if member is None:
-                known = ", ".join(each.name for each in kind.members[:8])
-                hint = suggest(step[1], kind.by_name) or f"; members: {known}"
-                raise ValueError(f"{kind.name} has no member {step[1]!r}{hint}")
-            kind, bit_offset = member.kind, bit_offset + member.bit_offset
-        else:
-            if not isinstance(kind, Array):
-                raise ValueError(f"{where} is {kind.name} and has no elements")
-            number = kind.index_of([int(each) for each in step[2].split(",")])
-            bit_offset += 8 * number * kind.element.size
-            kind = kind.element
-        at = step.end()
-    return Part(kind, bit_offset)
-
-
-def _element_hint(kind: DataType) -> str:
-    if not isinstance(kind, Array):
-        return ""
-    first = ",".join(str(low) for low, _ in kind.dimensions)
-    return f": expected an element of it before, such as [{first}]"
-
-
-def split_paths(name: str) -> Iterator[tuple[str, str]]:
-    """Yield each way to divide *name* into a variable and a path, the longest variable first."""
-    # Names of variables have dots of their own: bus0.axis.csp.Target.
-    for match in reversed(list(_DELIMITERS.finditer(name))):
-        if match.start():
-            yield name[: match.start()], name[match.start() :]
-
-
-def variable_of(name: str, known: Container[str]) -> str:
-    """Return the one of *known* variables that *name* is or lies in, else *name* itself."""
-    if name in known:
-        return name
-    return next((variable for variable, _ in split_paths(name) if variable in known), name)
-
-
-def find_variable(name: str, type_of: Callable[[str], DataType | None]) -> tuple[str, Part] | None:
-    """Return the variable that *name* is or lies in, and the part; None if there is none.
-
-    Args:
-        name: A variable, or a variable and a path into it; a variable of that name goes first.
-        type_of: Returns the type of a variable, None if there is none.
-
-    Raises:
-        ValueError: the variable has no such part.
-    """
-    kind = type_of(name)
-    if kind is not None:
-        return name, Part(kind, 0)
-    for variable, path in split_paths(name):
-        kind = type_of(variable)
-        if kind is not None:
-            return variable, find_part(kind, path)
-    return None
-
-
-class SharedPart(NamedTuple):
-    """A part that two types have in common, with its place in each of them."""
-
-    old_bit: int
-    new_bit: int
-    bits: int
-
-
-def shared_parts(old: DataType, new: DataType) -> Iterator[SharedPart]:
-    """Yield what both types have: all if they are equal, else members of one name and type."""
-    if old == new:
-        yield SharedPart(0, 0, new.bit_length)
-    elif (
-        isinstance(old, Structure)
-        and isinstance(new, Structure)
-        # In a union the copy of one member would overwrite that of another.
-        and not (old.is_union or new.is_union)
-    ):
-        for member in new.members:
-            if (was := old.by_name.get(member.name)) is None:
-                continue
-            for old_bit, new_bit, bits in shared_parts(was.kind, member.kind):
-                yield SharedPart(was.bit_offset + old_bit, member.bit_offset + new_bit, bits)
-
-
 def member_type_name(kind: DataType) -> str:
     """Return the name of a member's type: every BOOL of a struct has a byte, as a BOOL8 has."""
     return "BOOL" if kind.name == "BOOL8" else kind.name
-
-
-def parts_of(kind: DataType, path: str = "") -> Iterator[tuple[str, Part]]:
-    """Yield the members of *kind*, those of nested structs too, with their paths.
-
-    An array is one part; its elements are not listed.
-    """
-    if not isinstance(kind, Structure):
-        return
-    for member in kind.members:
-        own = f"{path}.{member.name}"
-        yield own, Part(member.kind, member.bit_offset)
-        for inner, part in parts_of(member.kind, own):
-            yield inner, Part(part.kind, member.bit_offset + part.bit_offset)

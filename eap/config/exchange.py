@@ -10,8 +10,8 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from eap.codec import datatypes
+from eap.codec.datatypes import variable_of
 from eap.codec.pd import FIRST_PD, PdHeader
-from eap.codec.structures import variable_of
 from eap.config.finding import FindingReport, one_beside, one_of
 from eap.config.index import Index, SentPd
 from eap.config.ports import (

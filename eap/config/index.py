@@ -19,8 +19,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
-from eap.codec.structures import find_variable
+from eap.codec.datatypes import DataType, find_variable
 from eap.config.finding import PlantFinding
 from eap.config.plant_sections import PlantFile
 from eap.config.structs import (

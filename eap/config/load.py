@@ -27,7 +27,8 @@ from eap.ams.spec import (
     TransportKind,
 )
 from eap.codec import datatypes
-from eap.codec.structures import complete, variable_of
+from eap.codec.datatypes import variable_of
+from eap.codec.structures import complete
 from eap.config.access import access_rules, check_access
 from eap.config.brokers import (
     broker_spec,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from eap.codec.structures import variable_of
+from eap.codec.datatypes import variable_of
 from eap.config.finding import FindingReport, one_beside, one_of
 from eap.config.index import Index
 from eap.config.structs import StationSection

@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
-from eap.codec.structures import complete, find_part, split_paths, variable_of
+from eap.codec.datatypes import DataType, find_part, split_paths, variable_of
+from eap.codec.structures import complete
 from eap.config.exchange import is_unresolved
 from eap.config.finding import FindingReport, one_beside, one_of
 from eap.config.index import Index, Span, VariablePart

@@ -18,8 +18,7 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType, is_finite
-from eap.codec.structures import variable_of
+from eap.codec.datatypes import DataType, is_finite, variable_of
 from eap.ids import Destination, InterfaceUri, MacAddr, ObjectId
 from eap.od.abort import AbortCode, SdoAbortError
 from eap.od.dictionary import ObjectDictionary

@@ -45,7 +45,7 @@ from eap.codec.amsdiscovery import (
     decode_discovery,
     encode_discovery,
 )
-from eap.codec.structures import find_variable
+from eap.codec.datatypes import find_variable
 from eap.control.by_ads import (
     CONFIGURE_METHODS,
     PART,

@@ -10,8 +10,8 @@ from typing import Literal, TextIO, TypeAlias
 import msgspec
 
 from eap.codec import datatypes
+from eap.codec.datatypes import find_variable
 from eap.codec.fieldaddresses import FieldPoint, place_text
-from eap.codec.structures import find_variable
 from eap.config.field import address_point, served_point
 from eap.config.field_sections import ModbusBridge, S7Bridge
 from eap.config.load import Plant

@@ -14,8 +14,7 @@ import msgspec
 
 from eap.closeable import Closeable
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType, is_finite
-from eap.codec.structures import find_variable
+from eap.codec.datatypes import DataType, find_variable, is_finite
 from eap.control.protocol import (
     MAX_LINE,
     SUBSCRIBE,
@@ -368,11 +367,13 @@ def write_variable(station: str, name: str, text: str, plant: str | None) -> Wri
     """
     with connect_station(station, plant) as client:
         variables = client.call(VARIABLES, station=station)
-        kinds = {each.name: datatypes.parse(each.type) for each in variables}
+        types = {each.name: each.type for each in variables}
         value: Any = text
         try:
             # The appliance reports an unknown name itself, with a suggestion.
-            if found := find_variable(name, kinds.get):
+            if found := find_variable(
+                name, lambda each: datatypes.parse(types[each]) if each in types else None
+            ):
                 value = _to_json(found[1].kind, text)
         except ValueError as exc:
             raise ControlError(f"variable {station}/{name}: {exc}", code="value") from None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eap.codec.structures import variable_of
+from eap.codec.datatypes import variable_of
 from eap.control.protocol import VARIABLES
 from eap.errors import ConfigError
 from eap.ops.recordings import published_in

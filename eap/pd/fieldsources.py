@@ -12,8 +12,8 @@ from typing import Any
 
 from eap.codec import datatypes
 from eap.codec.basetypes import DataType
-from eap.codec.datatypes import with_nan
-from eap.codec.structures import complete, find_variable
+from eap.codec.datatypes import find_variable, with_nan
+from eap.codec.structures import complete
 from eap.pd.spec import FieldSource, StationSpec, Substitute, VariableSpec
 
 OK, AGE = ".ok", ".age_ms"

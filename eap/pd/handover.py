@@ -16,8 +16,8 @@ from typing import NamedTuple
 from msgspec.structs import asdict, replace
 
 from eap.codec import datatypes
+from eap.codec.datatypes import shared_parts
 from eap.codec.pd import PdHeader
-from eap.codec.structures import shared_parts
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import ImageLayout, RxSlot

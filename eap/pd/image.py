@@ -27,8 +27,7 @@ from typing import Any
 import msgspec
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
-from eap.codec.structures import find_variable, split_paths
+from eap.codec.datatypes import DataType, find_variable, split_paths
 from eap.errors import ImageError, TornReadError
 from eap.pd.layout import (
     HEADER,

@@ -12,8 +12,8 @@ from functools import partial
 from types import MappingProxyType
 from typing import TypeAlias
 
+from eap.codec.datatypes import variable_of
 from eap.codec.pd import PdHeader
-from eap.codec.structures import variable_of
 from eap.pd.image import Image
 from eap.pd.layout import FieldSlot, ImageLayout, RxSlot
 from eap.pd.spec import LinkSpec

@@ -49,13 +49,12 @@ from eap.services.bus_table import BusFollower, BusTable
 from eap.services.control.audit import Audit, AuditFile
 from eap.services.control.bus_methods import Buses, GatewayMethods, bus_reports
 from eap.services.control.control_ads import ControlAds, RemoteControl
-from eap.services.control.control_server import ControlServer
+from eap.services.control.control_server import ControlServer, PeerRoles
 from eap.services.control.device_methods import DeviceMethods
 from eap.services.control.field_methods import FieldMethods
 from eap.services.control.log_methods import LogMethods
 from eap.services.control.login_log import LoginLog
 from eap.services.control.methods import Methods
-from eap.services.control.peer_roles import PeerRoles
 from eap.services.control.route_methods import AmsMethods, RouteMethods, RoutingMethods
 from eap.services.control.status import (
     ProcessMeter,

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from eap.codec.structures import variable_of
+from eap.codec.datatypes import variable_of
 from eap.config.selection import match_names
 from eap.config.web import STATE
 from eap.control.protocol import (

@@ -11,7 +11,7 @@ from eap.ads.space import OP, SAFEOP, SystemSpace, al_state_for, states_of
 from eap.ads.symbols import SymbolSpace, SymbolTable, SymbolVariable
 from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsError, AdsState, AdsStates, AdsSystemState, device_name
-from eap.codec.structures import Part, find_variable
+from eap.codec.datatypes import Part, find_variable
 from eap.ids import NetId
 
 BUS_NET_ID = NetId.parse("5.23.91.23.2.1")

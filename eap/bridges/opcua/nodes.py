@@ -15,7 +15,7 @@ from eap.bridges.feed import BridgeVariable
 from eap.bridges.opcua.values import Definition, UaType, converter, definitions_of
 from eap.codec import datatypes
 from eap.codec.basetypes import DataType, Integer
-from eap.codec.structures import parts_of
+from eap.codec.datatypes import parts_of
 from eap.config.web import STATE
 
 NET_ID = "net_id"

@@ -17,7 +17,7 @@ import errno
 import fcntl
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from hashlib import sha256
@@ -27,12 +27,19 @@ from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 
-from eap.ads.request import Operation, WriteControl
+from eap.ads.request import Operation, Read, ReadWrite, WriteControl
 from eap.ams.access import AddRoute, AuditedOperation, AuditEntry, group_and_offset, host_of
 from eap.ams.directory import Directory
 from eap.codec.ads import AdsError, IndexGroup
+from eap.codec.coe import CoeHeader, SdoHeader
+from eap.codec.mailbox import MailboxType
+from eap.control.bus import BusOpenParameters, MailboxData, kind_of
+from eap.control.device import ApplyAnswer, StateAnswer
+from eap.control.protocol import Request
+from eap.gateway.requests import error_in, operation_of
 from eap.ids import ObjectId
 from eap.net.limits import Rate, SourceRateLimiter, SourceRates
+from eap.od.abort import SdoAbortError
 
 MAX_BYTES = 8 << 20
 """Of the file before it is put aside."""
@@ -445,3 +452,120 @@ def operation_fields(operation: Operation | AddRoute) -> Iterator[tuple[str, Any
         yield "value", data.hex()
     else:
         yield "sha256", sha256(data).hexdigest()[:16]
+
+
+_CHANGES = frozenset(
+    (
+        *("write", "stop", "od_write", "request_state", "apply", "rollback"),
+        *("bus_bring", "bus_fault", "bus_forget", "bus_transfer", "gateway_start", "gateway_stop"),
+        *("routes_add", "routes_remove", "routes_import", "routes_add_remote"),
+        *("routing_apply", "routing_rollback", "set_log_level"),
+    )
+)
+_HIDDEN = frozenset(("password", "spec", "xml", "routing"))
+"""Parameters that are secret, or as long as a plant file."""
+_READ_COMMANDS = frozenset((1, 4, 7))
+"""Datagrams that only read: APRD, FPRD, BRD (ETG.1000.4)."""
+_EEPROM_OWNER, _EEPROM_CONTROL, _EEPROM_READ = 0x0500, 0x0502, "0001"
+"""Registers, and how the command begins that reads (ETG.1000.4)."""
+_MAX_TEXT = 200
+
+
+def change_of(
+    request: Request, opened: Callable[[int], BusOpenParameters | None]
+) -> tuple[str, dict[str, Any]] | None:
+    """Return the station that a request changes, and fields for the audit; None if it only reads.
+
+    Args:
+        request: As it came, not checked yet.
+        opened: Returns how a conversation with a slave was opened, None if there is none.
+    """
+    params = request.params
+    if request.method == "bus_ask":
+        number = params.get("conversation")
+        conversation = opened(number) if isinstance(number, int) else None
+        return None if conversation is None else _conversation_change(conversation, params)
+    if not _is_change(request):
+        return None
+    described = {key: _shortened(value) for key, value in params.items() if key not in _HIDDEN}
+    described.pop("origin", None)
+    origin = params.get("origin")
+    author = {}
+    if isinstance(origin, dict):
+        author = {key: _shortened(origin.get(key, "")) for key in ("user", "host", "comment")}
+        client = "@".join(str(author[key]) for key in ("user", "host") if author[key])
+        author["by"] = f"{_shortened(origin.get('transport', 'web'))}:{client}"
+    station = str(
+        described.pop("station", "") or str(described.get("target", "")).partition("/")[0]
+    )
+    return station, {"operation": request.method, "asked": described} | author
+
+
+def _is_change(request: Request) -> bool:
+    if request.method == "ams_ask":
+        # An ADS request has a line of its own, which does not know its author.
+        return request.params.get("origin") is not None
+    if request.method == "bus_transfer":
+        return not _are_reads(request.params)
+    return request.method in _CHANGES
+
+
+def error_in_result(result: Any, conversation: BusOpenParameters | None = None) -> str:
+    """Return why a result says that it was not done, empty if it was.
+
+    Args:
+        result: Of a request.
+        conversation: How the conversation was opened that it is an answer of, if it is one.
+    """
+    if conversation is not None and isinstance(result, MailboxData):
+        kind, answer = kind_of(conversation.protocol), bytes.fromhex(result.data)
+        code = error_in(kind, answer)
+        if code and kind is MailboxType.COE:
+            head = SdoHeader.decode(answer, CoeHeader.SIZE)
+            return str(SdoAbortError(head.value, head.index, head.subindex))
+        return AdsError.words_of(code) if code else ""
+    if isinstance(result, StateAnswer) and result.error is not None:
+        return result.error.text
+    return "; ".join(result.refused) if isinstance(result, ApplyAnswer) else ""
+
+
+def _conversation_change(
+    conversation: BusOpenParameters, params: Mapping[str, Any]
+) -> tuple[str, dict[str, Any]] | None:
+    try:
+        body = bytes.fromhex(params["request"])
+    except (KeyError, TypeError, ValueError):
+        return None
+    operation = operation_of(kind_of(conversation.protocol), body)
+    if operation is None or params.get("listen") or _is_read(operation):
+        return None
+    name = f"{conversation.station}/{conversation.port}/{conversation.slave}"
+    return conversation.station, {"name": name} | dict(operation_fields(operation))
+
+
+def _is_read(operation: Operation) -> bool:
+    is_lookup = isinstance(operation, ReadWrite) and operation.group == IndexGroup.FOE_OPEN_READ
+    return is_lookup or isinstance(operation, Read)
+
+
+def _are_reads(params: Mapping[str, Any]) -> bool:
+    rows = params.get("datagrams")
+    return not isinstance(rows, list) or all(map(_is_read_row, rows))
+
+
+def _is_read_row(row: Any) -> bool:
+    """Say whether a datagram changes nothing; an EEPROM is read by writing a command."""
+    match row:
+        case [command, *_] if command in _READ_COMMANDS:
+            return True
+        case [_, _, place, data, *_]:
+            # Registers 0x0500 and 0x0502: taking the EEPROM over and a read command change no
+            # content.
+            is_command = place == _EEPROM_CONTROL and str(data).startswith(_EEPROM_READ)
+            return is_command or place == _EEPROM_OWNER
+    return False
+
+
+def _shortened(value: Any) -> Any:
+    text = str(value)
+    return value if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"

@@ -48,12 +48,8 @@ from eap.errors import CodecError, ControlError, EapError
 from eap.ids import Endpoint, NetId
 from eap.net.limits import Rate, SourceRateLimiter, SourceRates
 from eap.services.ads.ads_service import begin_answer
-from eap.services.control.control_server import (
-    RecordChange,
-    change_of,
-    error_in_result,
-    failure_of,
-)
+from eap.services.control.audit import change_of, error_in_result
+from eap.services.control.control_server import RecordChange, failure_of
 from eap.services.routing.service import LocalRequest
 from eap.services.routing.station_router import StationRouter
 from eap.services.tasks import TaskSet

@@ -4,29 +4,33 @@ Rule 1: a client can only delay itself.  Nothing is queued for it: a subscriptio
 again when its last line has left, and a client that reads nothing for SLOW_READER_S is
 disconnected. A client's pending bus requests are cancelled when it leaves, and its conversations
 are ended.
-Rule 2: a process that may open the socket may do everything, unless the plant has users: then
-:mod:`eap.services.control.peer_roles` decides.  Changes are audited with the user, since a process
-number says nothing later.
+Rule 2: a process that may open the socket may do everything, unless the plant has users.  Then
+processes of the appliance's own user and of root still may: their files are open to them anyway.
+Other users have the role that the plant file gives them, and none without an entry there.  Changes
+are audited with the user, since a process number says nothing later.
 """
 
 from __future__ import annotations
 
 import asyncio
+import grp
 import logging
+import os
+import pwd
 import select
 import socket
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sized
+from collections.abc import AsyncIterator, Callable, Iterable, Sequence, Sized
 from contextlib import asynccontextmanager, suppress
 from functools import partial
-from typing import Any, SupportsIndex, TypeAlias
+from typing import Any, NamedTuple, SupportsIndex, TypeAlias
 
 from devicebus.errors import BusError
-from eap.ads.request import Operation, Read, ReadWrite
-from eap.codec.ads import AdsError, IndexGroup
-from eap.codec.coe import CoeHeader, SdoHeader
-from eap.codec.mailbox import MailboxType
-from eap.control.bus import BUS_METHODS, BusOpenParameters, MailboxData, kind_of
-from eap.control.device import ApplyAnswer, StateAnswer
+from eap.ads.request import AdsRefusedError, parse_request
+from eap.ams.access import service_of
+from eap.ams.spec import AccessService, Role
+from eap.config.selection import match_names
+from eap.config.users import PlantUserSection
+from eap.control.bus import BUS_METHODS, BusOpenParameters
 from eap.control.protocol import (
     MAX_CLIENTS,
     MAX_LINE,
@@ -48,139 +52,34 @@ from eap.control.protocol import (
     request_id,
 )
 from eap.errors import ControlError, EapError, ImageError
-from eap.gateway.requests import error_in, operation_of
 from eap.net.limits import Activity, ListenerLimits
 from eap.od.abort import SdoAbortError
 from eap.runtime.bus_errors import to_record
-from eap.services.control.audit import operation_fields
+from eap.runtime.logins import Principal
+from eap.services.control.audit import change_of, error_in_result
 from eap.services.control.bus_methods import BusConnection, Buses
 from eap.services.control.methods import Methods, Watch
-from eap.services.control.peer_roles import PeerRoles
 from eap.services.transports.accepting import Listeners, ListeningSocket, TaskConnection, process_of
 
 RecordChange: TypeAlias = Callable[[str, str, dict[str, Any]], None]
 """Called with who it was, station, and what is told of the change."""
 AnnounceChange: TypeAlias = Callable[[str, str, dict[str, Any]], str]
 """Called likewise before a change; returns why it may not be done, empty if it may."""
-_CHANGES = frozenset(
-    (
-        *("write", "stop", "od_write", "request_state", "apply", "rollback"),
-        *("bus_bring", "bus_fault", "bus_forget", "bus_transfer", "gateway_start", "gateway_stop"),
-        *("routes_add", "routes_remove", "routes_import", "routes_add_remote"),
-        *("routing_apply", "routing_rollback", "set_log_level"),
-    )
-)
-_HIDDEN = frozenset(("password", "spec", "xml", "routing"))
-"""Parameters that are secret, or as long as a plant file."""
-_READ_COMMANDS = frozenset((1, 4, 7))
-"""Datagrams that only read: APRD, FPRD, BRD (ETG.1000.4)."""
-_EEPROM_OWNER, _EEPROM_CONTROL, _EEPROM_READ = 0x0500, 0x0502, "0001"
-"""Registers, and how the command begins that reads (ETG.1000.4)."""
-_MAX_TEXT = 200
-
-
-def change_of(
-    request: Request, opened: Callable[[int], BusOpenParameters | None]
-) -> tuple[str, dict[str, Any]] | None:
-    """Return the station that a request changes, and fields for the audit; None if it only reads.
-
-    Args:
-        request: As it came, not checked yet.
-        opened: Returns how a conversation with a slave was opened, None if there is none.
-    """
-    params = request.params
-    if request.method == "bus_ask":
-        number = params.get("conversation")
-        conversation = opened(number) if isinstance(number, int) else None
-        return None if conversation is None else _conversation_change(conversation, params)
-    if not _is_change(request):
-        return None
-    described = {key: _shortened(value) for key, value in params.items() if key not in _HIDDEN}
-    described.pop("origin", None)
-    origin = params.get("origin")
-    author = {}
-    if isinstance(origin, dict):
-        author = {key: _shortened(origin.get(key, "")) for key in ("user", "host", "comment")}
-        client = "@".join(str(author[key]) for key in ("user", "host") if author[key])
-        author["by"] = f"{_shortened(origin.get('transport', 'web'))}:{client}"
-    station = str(
-        described.pop("station", "") or str(described.get("target", "")).partition("/")[0]
-    )
-    return station, {"operation": request.method, "asked": described} | author
-
-
-def _is_change(request: Request) -> bool:
-    if request.method == "ams_ask":
-        # An ADS request has a line of its own, which does not know its author.
-        return request.params.get("origin") is not None
-    if request.method == "bus_transfer":
-        return not _are_reads(request.params)
-    return request.method in _CHANGES
-
-
-def error_in_result(result: Any, conversation: BusOpenParameters | None = None) -> str:
-    """Return why a result says that it was not done, empty if it was.
-
-    Args:
-        result: Of a request.
-        conversation: How the conversation was opened that it is an answer of, if it is one.
-    """
-    if conversation is not None and isinstance(result, MailboxData):
-        kind, answer = kind_of(conversation.protocol), bytes.fromhex(result.data)
-        code = error_in(kind, answer)
-        if code and kind is MailboxType.COE:
-            head = SdoHeader.decode(answer, CoeHeader.SIZE)
-            return str(SdoAbortError(head.value, head.index, head.subindex))
-        return AdsError.words_of(code) if code else ""
-    if isinstance(result, StateAnswer) and result.error is not None:
-        return result.error.text
-    return "; ".join(result.refused) if isinstance(result, ApplyAnswer) else ""
-
-
-def _conversation_change(
-    conversation: BusOpenParameters, params: Mapping[str, Any]
-) -> tuple[str, dict[str, Any]] | None:
-    try:
-        body = bytes.fromhex(params["request"])
-    except (KeyError, TypeError, ValueError):
-        return None
-    operation = operation_of(kind_of(conversation.protocol), body)
-    if operation is None or params.get("listen") or _is_read(operation):
-        return None
-    name = f"{conversation.station}/{conversation.port}/{conversation.slave}"
-    return conversation.station, {"name": name} | dict(operation_fields(operation))
-
-
-def _is_read(operation: Operation) -> bool:
-    is_lookup = isinstance(operation, ReadWrite) and operation.group == IndexGroup.FOE_OPEN_READ
-    return is_lookup or isinstance(operation, Read)
-
-
-def _are_reads(params: Mapping[str, Any]) -> bool:
-    rows = params.get("datagrams")
-    return not isinstance(rows, list) or all(map(_is_read_row, rows))
-
-
-def _is_read_row(row: Any) -> bool:
-    """Say whether a datagram changes nothing; an EEPROM is read by writing a command."""
-    match row:
-        case [command, *_] if command in _READ_COMMANDS:
-            return True
-        case [_, _, place, data, *_]:
-            # Registers 0x0500 and 0x0502: taking the EEPROM over and a read command change no
-            # content.
-            is_command = place == _EEPROM_CONTROL and str(data).startswith(_EEPROM_READ)
-            return is_command or place == _EEPROM_OWNER
-    return False
-
-
-def _shortened(value: Any) -> Any:
-    text = str(value)
-    return value if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"
-
-
 _FIRST_REQUEST_S = 1.0
 LIMITS = ListenerLimits(total=MAX_CLIENTS, reserved=0, per_host=MAX_CLIENTS)
+
+_ROOT = 0
+_FOR_VIEWERS = frozenset(
+    (
+        *("hello", "status", "pd_list", "variables", "read", "subscribe", "unsubscribe", "state"),
+        *("od_list", "od_describe", "od_read", "od_dump", "export", "plan", "routing_export"),
+        *("routing_plan", "gateway_status", "routes_list", "routes_test", "routes_export", "trace"),
+        *("log_levels", "field_points", "bus_describe", "bus_open", "bus_close"),
+    )
+)
+"""Methods that change nothing."""
+_BY_PARAMETERS = frozenset(("bus_ask", "bus_transfer"))
+"""Methods that read or change; so does ams_ask, of which the audit has the ADS request."""
 
 logger = logging.getLogger(__name__)
 
@@ -307,6 +206,115 @@ class ControlConnection(TaskConnection):
         if self.subscriptions:
             return Activity.SUBSCRIBED
         return Activity.BUSY if self.is_answered else super().activity
+
+
+class ControlPeer(NamedTuple):
+    """Client of the control socket.
+
+    Attributes:
+        text: User and process, for the audit.
+        user: User of the plant file, with a role; its name is empty for the appliance's own user.
+    """
+
+    text: str
+    user: Principal
+
+    @property
+    def is_own(self) -> bool:
+        """True for root and the appliance's user, whose programs may act for other users."""
+        return not self.user.name
+
+
+class PeerRoles:
+    """Roles of clients.
+
+    Args:
+        users: Users of the plant; without any, each client may do everything.
+        operators: Patterns of the variables that operators set.
+    """
+
+    def __init__(
+        self, users: Sequence[PlantUserSection] = (), operators: Iterable[str] = ()
+    ) -> None:
+        self._users = users
+        self._operators = tuple(operators)
+
+    def own_peer(self, connection: socket.socket) -> ControlPeer | None:
+        """Return a client that may do everything, None if the user database has to be asked."""
+        pid, uid = process_of(connection)
+        if self._users and uid not in {_ROOT, os.geteuid()}:
+            return None
+        return ControlPeer(_peer_text(pid, uid), Principal("", Role.ENGINEER))
+
+    def identify(self, connection: socket.socket) -> ControlPeer | None:
+        """Return another client, by the user database; None for one without a role."""
+        pid, uid = process_of(connection)
+        try:
+            account = pwd.getpwuid(uid)
+        except KeyError:
+            return None
+        groups = {_group_name(gid) for gid in os.getgrouplist(account.pw_name, account.pw_gid)}
+        for user in self._users:
+            if account.pw_name in user.unix or not groups.isdisjoint(user.groups):
+                return ControlPeer(_peer_text(pid, uid), Principal(user.name, user.role))
+        return None
+
+    def reason_denied(
+        self, peer: ControlPeer, request: Request, *, is_change: Callable[[], bool]
+    ) -> str:
+        """Return why a client may not make a request, empty if it may.
+
+        *is_change* says whether one that depends on its parameters changes something.
+        """
+        if peer.is_own:
+            return ""
+        if request.params.get("origin") is not None:
+            return "only programs of the appliance's user act for other users"
+        needed = _needed_role(request, is_change)
+        if not peer.user.may_act_as(needed):
+            return f"{peer.user.name} is {peer.user.role}, and {request.method} needs {needed}"
+        if request.method == "write" and peer.user.role is Role.OPERATOR:
+            return self._reason_not_set(request.params)
+        return ""
+
+    def _reason_not_set(self, params: dict[str, Any]) -> str:
+        values = params.get("values")
+        for name in values if isinstance(values, dict) else ():
+            full = f"{params.get('station')}/{name}"
+            if not any(match_names(pattern, [full]) for pattern in self._operators):
+                return f"{full} is set by engineers only: access.operators does not name it"
+        return ""
+
+
+def _peer_text(pid: int, uid: int) -> str:
+    return f"uid {uid}, pid {pid}"
+
+
+def _needed_role(request: Request, is_change: Callable[[], bool]) -> Role:
+    if request.method == "write":
+        return Role.OPERATOR
+    if request.method in _FOR_VIEWERS:
+        return Role.VIEWER
+    is_read = request.method in _BY_PARAMETERS and not is_change()
+    return Role.VIEWER if is_read or _is_ads_read(request) else Role.ENGINEER
+
+
+def _is_ads_read(request: Request) -> bool:
+    if request.method != "ams_ask":
+        return False
+    try:
+        data = bytes.fromhex(request.params.get("data", ""))
+        operations = parse_request(request.params["command"], data).operations
+    except (AdsRefusedError, KeyError, TypeError, ValueError):
+        return False
+    return all(service_of(each) is AccessService.READ for each in operations)
+
+
+def _group_name(gid: int) -> str:
+    try:
+        return grp.getgrgid(gid).gr_name
+    except KeyError:
+        return ""
 
 
 class _Reader(asyncio.StreamReader):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from eap.codec import datatypes
-from eap.codec.structures import find_variable
+from eap.codec.datatypes import find_variable
 from eap.control import field as control
 from eap.control.protocol import ErrorCode, Written, of_station
 from eap.errors import ControlError

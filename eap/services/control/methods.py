@@ -15,7 +15,7 @@ from typing import Any
 from msgspec.structs import asdict
 
 from eap.codec import datatypes
-from eap.codec.structures import variable_of
+from eap.codec.datatypes import variable_of
 from eap.control import protocol as control
 from eap.control.bus import BUS_METHODS
 from eap.control.protocol import VERSION, ErrorCode, of_station, parameters

@@ -10,8 +10,7 @@ from time import monotonic_ns
 from typing import Any
 
 from eap.codec import datatypes
-from eap.codec.datatypes import DataType
-from eap.codec.structures import find_variable, variable_of
+from eap.codec.datatypes import DataType, find_variable, variable_of
 from eap.errors import EnvironmentalError, ImageError
 from eap.net.host import Host, open_replay
 from eap.net.image_file import StationImage

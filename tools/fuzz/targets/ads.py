@@ -15,7 +15,7 @@ from eap.codec import datatypes
 from eap.codec.ads import AdsDeviceInfo, AdsState, AdsStates, IndexGroup, device_name
 from eap.codec.adsnotification import decode_notification
 from eap.codec.ams import AmsCommand, AmsHeader
-from eap.codec.structures import Part, find_variable
+from eap.codec.datatypes import Part, find_variable
 from eap.ids import Endpoint, NetId
 from tools.fuzz.messages import cut
 

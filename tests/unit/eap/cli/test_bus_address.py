@@ -6,11 +6,11 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from eap.cli.output import json_option
 from eap.cli.params import (
     BusCommand,
     StationBus,
     bus_options,
-    json_option,
     open_session,
     parse_port,
     parse_uri,

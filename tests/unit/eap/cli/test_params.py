@@ -3,7 +3,8 @@ from __future__ import annotations
 import click
 import pytest
 
-from eap.cli.params import VariableName, examples, parse_assignment, parse_names
+from eap.cli.params import examples
+from eap.cli.pd import VariableName, parse_assignment, parse_names
 
 
 @pytest.mark.parametrize(

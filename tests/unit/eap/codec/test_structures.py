@@ -21,18 +21,10 @@ from eap.codec.basetypes import (
     WideChar,
     WideString,
 )
-from eap.codec.datatypes import is_finite, parse
+from eap.codec.datatypes import find_part, is_finite, parse, parts_of, split_paths
 from eap.codec.enumerations import Enumeration, EnumValue, make_enumeration
 from eap.codec.literals import write_literal
-from eap.codec.structures import (
-    Member,
-    Structure,
-    find_part,
-    lay_out_structure,
-    make_structure,
-    parts_of,
-    split_paths,
-)
+from eap.codec.structures import Member, Structure, lay_out_structure, make_structure
 from eap.codec.times import TIMES
 from tests.support.ctypes_layout import c_layout, c_type
 

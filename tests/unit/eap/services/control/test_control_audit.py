@@ -9,7 +9,7 @@ import pytest
 from eap.control.bus import BusOpenParameters, MailboxData
 from eap.control.device import ApplyAnswer, StateAnswer, StateError
 from eap.control.protocol import Request
-from eap.services.control.control_server import change_of, error_in_result
+from eap.services.control.audit import change_of, error_in_result
 
 
 def opened(protocol: str = "coe") -> BusOpenParameters:

@@ -20,9 +20,13 @@ from eap.pd.spec import PortKind, PortSpec, StationSpec
 from eap.runtime.logins import Principal
 from eap.services.control import control_server
 from eap.services.control.bus_methods import Buses
-from eap.services.control.control_server import ControlConnection, ControlServer
+from eap.services.control.control_server import (
+    ControlConnection,
+    ControlPeer,
+    ControlServer,
+    PeerRoles,
+)
 from eap.services.control.methods import Methods, Watch
-from eap.services.control.peer_roles import ControlPeer, PeerRoles
 from eap.services.engine_link import EngineLink
 from eap.services.transports.accepting import Listeners
 from tests.support.eventually import eventually, settle

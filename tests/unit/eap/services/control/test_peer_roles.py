@@ -16,8 +16,8 @@ from eap.codec.ams import AmsCommand
 from eap.config.users import PlantUserSection
 from eap.control.protocol import Request
 from eap.runtime.logins import Principal
-from eap.services.control import peer_roles
-from eap.services.control.peer_roles import ControlPeer, PeerRoles
+from eap.services.control import control_server
+from eap.services.control.control_server import ControlPeer, PeerRoles
 
 USERS = (
     PlantUserSection(name="anna", role=Role.ENGINEER, unix=("anna",)),
@@ -42,7 +42,7 @@ def host(monkeypatch):
 
 
 def identify(monkeypatch, uid: int, users=USERS) -> Principal | None:
-    monkeypatch.setattr(peer_roles, "process_of", lambda _: (9, uid))
+    monkeypatch.setattr(control_server, "process_of", lambda _: (9, uid))
     roles, (ours, theirs) = PeerRoles(users), socket.socketpair()
     with ours, theirs:
         peer = roles.own_peer(theirs) or roles.identify(theirs)
