@@ -5,6 +5,6 @@
 that a scan, a state change and a hundred mailboxes share one link.  :mod:`scan`, :mod:`startup`,
 :mod:`bring`, :mod:`esm`, :mod:`clocks`, :mod:`eeprom`, :mod:`watch` and :mod:`diagnosis` are such
 procedures; :mod:`findings` turns their results into text.  :mod:`cycle` and :mod:`image` exchange
-process data; :mod:`mailboxes` and :mod:`conversation_queue` are the mailbox of one slave.
+process data; :mod:`mailboxes` and :mod:`queues` are the mailbox of one slave.
 :class:`devicebus.master.master.Master` puts them together; a driver feeds it frames and time.
 """

@@ -1,6 +1,6 @@
 """Mailbox of one slave: one request at a time, for all requesters, with counters (ETG.1000.4).
 
-:mod:`conversation_queue` queues conversations and matches replies; :class:`MailboxPort` writes and
+:mod:`queues` queues conversations and matches replies; :class:`MailboxPort` writes and
 reads sync managers 0 and 1.  A message whose write frame was lost is written again with the same
 counter, by which the slave drops the repetition.  A message whose read frame was lost is requested
 again by the repeat bit.
@@ -33,10 +33,15 @@ from devicebus.mailbox.conversation import (
     next_counter,
 )
 from devicebus.mailbox.protocol import MINIMUM_SIZE, MailboxSizes
-from devicebus.master.conversation_queue import ConversationQueue, QueuedConversation
-from devicebus.master.forwarding import LIMIT_NS, ForwardedMessage, ForwardQueue
 from devicebus.master.link import MAX_DATA
 from devicebus.master.procedure import Procedure, Runner, Sleep, Task, read, write
+from devicebus.master.queues import (
+    FORWARD_LIMIT_NS,
+    ConversationQueue,
+    ForwardedMessage,
+    ForwardQueue,
+    QueuedConversation,
+)
 from devicebus.wire.datagram import fprd, fpwr
 from devicebus.wire.register import Register, SmStatus, SyncManager
 from eap.codec.mailbox import (
@@ -385,7 +390,7 @@ class Mailbox:
 
     def post(self, source: int, kind: MailboxType, data: bytes, now_ns: int) -> bool:
         """Write a message of another slave as soon as this one takes it; False if it cannot be."""
-        message = ForwardedMessage(source, kind, data, now_ns + LIMIT_NS)
+        message = ForwardedMessage(source, kind, data, now_ns + FORWARD_LIMIT_NS)
         fits = MailboxHeader.SIZE + len(data) <= self.sizes.to_slave
         if not (self._is_open and fits and self._forwards.add(message)):
             return False

@@ -6,7 +6,7 @@ import pytest
 
 from devicebus.errors import BusError
 from devicebus.mailbox.conversation import MailboxRequest, is_unsolicited
-from devicebus.master.conversation_queue import (
+from devicebus.master.queues import (
     ConversationQueue,
     QueuedConversation,
     ReplyMatcher,

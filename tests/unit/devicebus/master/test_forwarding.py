@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from devicebus.mailbox import coe_client
-from devicebus.master.forwarding import MAX_WAITING
 from devicebus.master.master import Master
+from devicebus.master.queues import MAX_WAITING
 from devicebus.wire.alstatus import AlState
 from eap.codec.coe import CoeService, SdoRequest, encode_message, encode_plain
 from eap.codec.mailbox import MailboxType, decode_message

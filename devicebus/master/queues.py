@@ -1,4 +1,4 @@
-"""Queue of the conversations with one slave, and the matching of its replies to their requests.
+"""Queues of one slave's mailbox: its conversations, and messages of other slaves.
 
 Conversations of one protocol run one after the other, because a server has only one transfer;
 requesters alternate.  Protocols alternate message by message, so that a long file transfer does not
@@ -8,13 +8,19 @@ The counter of a reply is unrelated to its request.  After a time-out requests t
 in the address field, which slaves echo.  Some slaves do not echo it: then the first reply that fits
 the request that timed out counts as late.  A slave may send the next fragment of an answer before
 the master listens for it; such a fragment is stored.
+
+The master forwards messages between slaves of one bus (ETG.1000.4).  A slave addresses another one
+by the station address in the mailbox header.  The master writes the message to that slave with the
+address of the sender instead, which is echoed in the reply, so the reply goes back by the same
+rule.  Some slaves write address 0 into replies: such a message goes back to the slave whose request
+it answers, if the master has no request of that kind itself.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Hashable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 from devicebus.errors import MailboxClosedError
 from devicebus.mailbox.conversation import (
@@ -33,6 +39,10 @@ _TAG = 0x8000
 _TAGS = 0x3FFF
 MAX_STORED = 64
 """Limit for stored fragments."""
+MAX_WAITING = 16
+"""Limit for messages that wait for one slave, and for requests to it without a reply yet."""
+FORWARD_LIMIT_NS = 1_000_000_000
+"""Time within which a slave has to take a message."""
 
 
 class ReplyMatcher:
@@ -223,3 +233,47 @@ class ConversationQueue:
                 if not job.task.is_done:
                     job.conversation.close()
                     job.task.fail(MailboxClosedError(f"{job.task.name}: {reason}"))
+
+
+class ForwardedMessage(NamedTuple):
+    """Message from one slave to another, without mailbox header."""
+
+    source: int
+    """Station address of the sender."""
+    type: MailboxType
+    data: bytes
+    deadline_ns: int
+
+
+class ForwardQueue:
+    """Messages of other slaves for one slave."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[ForwardedMessage] = deque()
+        self._asked: deque[ForwardedMessage] = deque(maxlen=MAX_WAITING)
+
+    @property
+    def first(self) -> ForwardedMessage | None:
+        """The next message to write, None without one."""
+        return self._waiting[0] if self._waiting else None
+
+    def add(self, message: ForwardedMessage) -> bool:
+        """Queue a message; return False if too many wait."""
+        if len(self._waiting) >= MAX_WAITING:
+            return False
+        self._waiting.append(message)
+        return True
+
+    def end_first(self, *, is_written: bool) -> None:
+        """Remove the first message; the slave may reply to one that was written."""
+        message = self._waiting.popleft()
+        if is_written:
+            self._asked.append(message)
+
+    def take_source(self, kind: MailboxType, data: bytes) -> int | None:
+        """Return the slave whose request a message answers, once; None if there is none."""
+        for message in self._asked:
+            if message.type is kind and answers(kind, message.data, data):
+                self._asked.remove(message)
+                return message.source
+        return None
