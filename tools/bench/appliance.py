@@ -17,14 +17,14 @@ import msgspec
 
 from eap.runtime.folder import VARIABLE
 from eap.runtime.store import VARIABLE as STATE_VARIABLE
-from tools.bench.machine import ProcessSample, memory_folder
+from tools.bench.machine import ProcessSample, kernel_share, memory_folder
 from tools.bench.network import ROOT, Cable
 from tools.bench.pacing import wait
 
 PROCESSES = ("supervisor", "engine", "services")
 _READY_WITHIN_S = 60.0
 _END_WITHIN_S = 10.0
-_WARM_UP_S = 1.0
+_WARM_UP_S = 2.0
 _EAPCTL = (sys.executable, "-m", "eap")
 
 
@@ -32,8 +32,9 @@ class Observation(msgspec.Struct, frozen=True):
     """Counters of an appliance over *seconds*.
 
     Attributes:
-        cpu: Share of one core of each process.
-        rss: Octets of each process.
+        cpu: Share of one core of each process; those of segments are named after their buses.
+        kernel: Part of *cpu* that was spent in the kernel.
+        rss: Octets of each process, likewise.
         lost: Frames lost, over all subscriptions.
         received: PDs received, likewise.
         overruns: Cycles left out because the engine came too late.
@@ -43,6 +44,7 @@ class Observation(msgspec.Struct, frozen=True):
 
     seconds: float
     cpu: dict[str, float]
+    kernel: dict[str, float]
     rss: dict[str, int]
     lost: int
     received: int
@@ -95,17 +97,17 @@ def observe(plant: Path, seconds: float, link: Cable | None) -> Observation:
     with running(plant, link) as environment:
         wait(_WARM_UP_S)
         first = status(link, environment)
-        pids = {name: int(first["processes"][name]["pid"]) for name in PROCESSES}
+        pids = _pids(first["processes"])
         before = {name: ProcessSample(pid) for name, pid in pids.items()}
         wait(seconds)
         after = {name: ProcessSample(pid) for name, pid in pids.items()}
         last = status(link, environment)
+    cpu = {name: (after[name].cpu_ns - before[name].cpu_ns) / seconds / 1e9 for name in pids}
     return Observation(
         seconds=seconds,
-        cpu={
-            name: (after[name].cpu_ns - before[name].cpu_ns) / seconds / 1e9 for name in PROCESSES
-        },
-        rss={name: after[name].rss for name in PROCESSES},
+        cpu=cpu,
+        kernel={name: cpu[name] * kernel_share(before[name], after[name]) for name in pids},
+        rss={name: after[name].rss for name in pids},
         lost=sum(pd["lost"] or 0 for station in last["stations"] for pd in station["pd"]["rx"]),
         received=sum(pd["received"] for station in last["stations"] for pd in station["pd"]["rx"]),
         overruns=sum(s["overruns"] for s in last["stations"]),
@@ -115,6 +117,12 @@ def observe(plant: Path, seconds: float, link: Cable | None) -> Observation:
             for key in ("p50", "p99", "max")
         },
     )
+
+
+def _pids(processes: dict[str, Any]) -> dict[str, int]:
+    segments = processes.get("segments", {})
+    single = {name: each for name, each in processes.items() if "pid" in each}
+    return {name: int(each["pid"]) for name, each in (single | segments).items()}
 
 
 def status(link: Cable | None, environment: dict[str, str]) -> dict[str, Any]:

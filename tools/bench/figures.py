@@ -21,30 +21,42 @@ class Decision(StrEnum):
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """One line of the table; *value* is the number behind *measured*, where there is one."""
+    """One line of a table.
+
+    Attributes:
+        value: Number behind *measured*, where there is one.
+        limit: The machine's own limit, which bounds the figure; a figure with one is among the
+            targets of the project.
+    """
 
     name: str
     measured: str
     target: str = ""
     decision: Decision = Decision.REPORTED
     value: float | None = None
+    limit: str = ""
 
 
 class SkippedError(Exception):
     """This machine lacks what a benchmark needs; the message says what."""
 
 
-def at_least(name: str, value: float, target: float, detail: str = "") -> Figure:
-    """Return a ratio that should not be smaller than *target*."""
+def at_least(
+    name: str, value: float, target: float, detail: str = "", *, unit: str = "", limit: str = ""
+) -> Figure:
+    """Return a figure that should not be smaller than *target*; a ratio without *unit*."""
     decision = Decision.OK if value >= target else Decision.MISSED
-    return Figure(name, _with(f"{value:.2f}", detail), f"≥ {target:g}", decision, value)
+    shown = _with(_shown(value, unit), detail)
+    return Figure(name, shown, f"≥ {target:g}{unit}", decision, value, limit)
 
 
-def at_most(name: str, value: float, target: float, unit: str = "", detail: str = "") -> Figure:
-    """Return a figure that should not be larger than *target*."""
+def at_most(
+    name: str, value: float, target: float, unit: str = "", detail: str = "", *, limit: str = ""
+) -> Figure:
+    """Return a figure that should not be larger than *target*; a ratio without *unit*."""
     decision = Decision.OK if value <= target else Decision.MISSED
-    shown = f"{value:.2f}" if not unit else f"{value:.3g}{unit}"
-    return Figure(name, _with(shown, detail), f"≤ {target:g}{unit}", decision, value)
+    shown = _with(_shown(value, unit), detail)
+    return Figure(name, shown, f"≤ {target:g}{unit}", decision, value, limit)
 
 
 def report(name: str, measured: str, value: float | None = None) -> Figure:
@@ -68,21 +80,19 @@ def median_ratio(pairs: Iterable[tuple[float, float]]) -> float:
     return median(ours / reference for ours, reference in pairs)
 
 
-def text_table(figures: Sequence[Figure]) -> str:
-    """Return *figures* in aligned columns."""
-    rows = [("figure", "target", "measured", "result")]
-    rows += [(f.name, f.target, f.measured, f.decision.value) for f in figures]
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+def text_table(figures: Sequence[Figure], *, limits: bool = False) -> str:
+    """Return *figures* in aligned columns, with that of the limits if wanted."""
+    rows = _rows(figures, limits=limits)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows]
     lines.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join(line.rstrip() for line in lines)
 
 
-def markdown_table(figures: Sequence[Figure]) -> str:
-    """Return *figures* as a table of Markdown."""
-    rows = ["| figure | target | measured | result |", "|---|---|---|---|"]
-    rows += [f"| {f.name} | {f.target} | {f.measured} | {f.decision.value} |" for f in figures]
-    return "\n".join(rows)
+def markdown_table(figures: Sequence[Figure], *, limits: bool = False) -> str:
+    """Return *figures* as a table of Markdown, with the column of the limits if wanted."""
+    head, *rows = (f"| {' | '.join(row)} |" for row in _rows(figures, limits=limits))
+    return "\n".join([head, "|" + "---|" * (head.count("|") - 1), *rows])
 
 
 def replace_between(text: str, begin: str, end: str, new: str) -> str:
@@ -96,6 +106,16 @@ def replace_between(text: str, begin: str, end: str, new: str) -> str:
     if not found or not found_end:
         raise ValueError(f"the markers {begin} and {end} are missing")
     return f"{head}{begin}\n{new}\n{end}{tail}"
+
+
+def _rows(figures: Sequence[Figure], *, limits: bool) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = [("figure", "target", "measured", "result", "limit")]
+    rows += [(f.name, f.target, f.measured, f.decision.value, f.limit) for f in figures]
+    return rows if limits else [row[:-1] for row in rows]
+
+
+def _shown(value: float, unit: str) -> str:
+    return f"{value:.3g}{unit}" if unit else f"{value:.2f}"
 
 
 def _with(shown: str, detail: str) -> str:

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
-import msgspec
-
 from tools.bench import machine
+from tools.bench.endpoints import Endpoint, carry
 from tools.bench.figures import Figure, SkippedError, at_most, median_ratio, report, skipped
-from tools.bench.network import Cable, Page, cable
+from tools.bench.network import Cable, cable
 from tools.bench.settings import Settings
 from tools.bench.stations import Shape
 
-TITLE = "One-way latency of a 600-byte PD at 1 kHz, woken on arrival, beside a blocking raw loop"
+TITLE = "One-way latency of a 600-byte PD at 1 kHz, woken on arrival, beside blocking loops"
 SHAPE = Shape(1, 1, 600)
-OURS = ("product_roles.publish_paced", "product_roles.subscribe_on_arrival")
-RAW = ("raw_roles.send_paced", "raw_roles.receive_stamps")
+OURS = Endpoint("ours", "product_roles.publish_paced", "product_roles.subscribe_on_arrival")
+RAW = Endpoint("the raw Python loop", "raw_roles.send_paced", "raw_roles.receive_stamps")
+C = Endpoint("the C loop", "c.send_paced", "c.receive_stamps")
+PEERS = tuple(
+    Endpoint(name, f"{module}.send_paced", f"{module}.receive_stamps", package)
+    for name, module, package in (
+        ("ZeroMQ PUB/SUB", "zmq_roles", ("pyzmq", "zmq")),
+        ("zenoh", "zenoh_roles", ("eclipse-zenoh", "zenoh")),
+        ("CycloneDDS", "dds_roles", ("cyclonedds", "cyclonedds")),
+    )
+)
+TARGETS = {True: 1.3, False: 1.15}
+"""Largest ratio to the raw Python loop, with and without PM QoS."""
 
 
 def run(settings: Settings) -> list[Figure]:
@@ -26,55 +35,52 @@ def run(settings: Settings) -> list[Figure]:
     machine.require_cores()
     figures = []
     with cable() as link:
-        for on in (True, False):
+        for on, target in TARGETS.items():
             name = f"latency, PM QoS {'on' if on else 'off'}"
             settings.tell(name)
             try:
                 with machine.pm_qos(on=on):
-                    figures += _measure(link, settings, name)
+                    figures += figures_of(name, target, _measure(link, settings))
             except SkippedError as reason:
                 figures.append(skipped(name, reason))
     return figures
 
 
-def _measure(link: Cable, settings: Settings, name: str) -> list[Figure]:
-    ours: list[dict[str, Any]] = []
-    raw: list[dict[str, Any]] = []
-    rounds = max(2, settings.rounds // 2)
-    for number in range(rounds):
-        for way, results in ((OURS, ours), (RAW, raw)):
-            results.append(_run(link, way, settings.latency_s, swap=bool(number % 2)))
-    pairs = [(a["p50"], b["p50"]) for a, b in zip(ours, raw, strict=True)]
-    detail = f"{_us(ours, 'p50')} to {_us(raw, 'p50')} µs"
-    figures = [at_most(f"{name}: p50, ratio to the raw loop", median_ratio(pairs), 1.3, "", detail)]
+def figures_of(
+    name: str, target: float, results: Mapping[str, Sequence[dict[str, Any]]]
+) -> list[Figure]:
+    """Compare ours with the others; *results* has distributions in nanoseconds, by round."""
+    ours, limit = results[OURS.name], "the C loop, not measured"
+    if C.name in results:
+        limit = f"{C.name}: {_us(results[C.name], 'p50')} µs"
+    figures = []
+    for way in (RAW, C, *PEERS):
+        title = f"{name}: p50, ratio to {way.name}"
+        if way.name not in results:
+            figures.append(skipped(title, way.lacks()))
+            continue
+        theirs = results[way.name]
+        ratio = median_ratio((a["p50"], b["p50"]) for a, b in zip(ours, theirs, strict=True))
+        detail = f"{_us(ours, 'p50')} to {_us(theirs, 'p50')} µs"
+        if way is RAW:
+            figures.append(at_most(title, ratio, target, "", detail, limit=limit))
+        else:
+            figures.append(report(title, f"{ratio:.2f} ({detail})", ratio))
+    raw = results[RAW.name]
     tails = ", ".join(f"{key} {_us(ours, key)} to {_us(raw, key)} µs" for key in ("p99", "max"))
-    return [*figures, report(f"{name}: tails", tails)]
+    return [*figures, report(f"{name}: tails, ours to {RAW.name}", tails)]
 
 
-def _us(results: list[dict[str, Any]], key: str) -> str:
+def _measure(link: Cable, settings: Settings) -> dict[str, list[dict[str, Any]]]:
+    ways = [way for way in (OURS, RAW, C, *PEERS) if not way.lacks()]
+    results: dict[str, list[dict[str, Any]]] = {way.name: [] for way in ways}
+    for number in range(max(2, settings.rounds // 2 + 1)):
+        for way in ways[:: -1 if number % 2 else 1]:
+            seconds = settings.latency_s
+            _, found = carry(link, way, SHAPE, seconds, swap=number // 2 % 2 == 1)
+            results[way.name].append(found)
+    return results
+
+
+def _us(results: Sequence[dict[str, Any]], key: str) -> str:
     return f"{median(result[key] for result in results) / 1000:.1f}"
-
-
-def _run(link: Cable, way: tuple[str, str], seconds: float, *, swap: bool) -> dict[str, Any]:
-    sending, receiving = machine.cores() if not swap else machine.cores()[::-1]
-    folder = Path(link.folder)
-    for left in (folder / "page", *folder.glob("*.image")):
-        left.unlink(missing_ok=True)
-    page = Page(folder / "page")
-    job = {
-        "shape": msgspec.structs.asdict(SHAPE),
-        "folder": str(folder),
-        "page": str(folder / "page"),
-        "seconds": seconds,
-    }
-    with ExitStack() as stack:
-        receiver = stack.enter_context(
-            link.worker(way[1], job | {"interface": link.interface(1)}, side=1, cpu=receiving)
-        )
-        receiver.answer()
-        sender = stack.enter_context(
-            link.worker(way[0], job | {"interface": link.interface(0)}, side=0, cpu=sending)
-        )
-        sender.answer()
-        page.words[Page.STOP] = 1
-        return receiver.answer()

@@ -6,10 +6,12 @@ import os
 import platform
 import shutil
 import struct
+import sysconfig
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from eap.compiled import cyclic
 from tools.bench.figures import SkippedError
 
 _PM_QOS = Path("/dev/cpu_dma_latency")
@@ -25,18 +27,36 @@ class ProcessSample:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
         self.rss = pages * os.sysconf("SC_PAGE_SIZE")
         """Octets."""
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        self.user_ticks, self.kernel_ticks = int(fields[11]), int(fields[12])
+
+
+def kernel_share(before: ProcessSample, after: ProcessSample) -> float:
+    """Return the part of its processor time that a process spent in the kernel, by its ticks."""
+    kernel = after.kernel_ticks - before.kernel_ticks
+    return kernel / max(kernel + after.user_ticks - before.user_ticks, 1)
 
 
 def describe() -> str:
-    """Return one line: processors, kernel, Python."""
+    """Return one line: processors, kernel, Python with its build, and the compiled part."""
     info = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     models = [line.partition(":")[2].strip() for line in info.splitlines() if "model name" in line]
     model = models[0] if models else platform.machine()
     virtual = ", virtual machine" if " hypervisor" in info else ""
     return (
         f"{os.cpu_count()} cores of {model}{virtual}; Linux {os.uname().release}; "
-        f"{platform.python_implementation()} {platform.python_version()}"
+        f"{platform.python_implementation()} {platform.python_version()}, {_build()}; "
+        f"cyclic path {'in Python' if cyclic is None else 'compiled'}"
     )
+
+
+def _build() -> str:
+    """Return whether Python was built with optimisation by profile, and at link time."""
+    options = sysconfig.get_config_var("CONFIG_ARGS") or ""
+    flags = sysconfig.get_config_var("PY_CORE_CFLAGS") or ""
+    if "--enable-optimizations" not in options and "-fprofile-use" not in flags:
+        return "built without optimisation by profile"
+    return "built with optimisation by profile" + " and at link time" * ("--with-lto" in options)
 
 
 def require_root() -> None:

@@ -9,11 +9,16 @@ from typing import Any
 
 import msgspec
 
+from eap.net.ticker import Ticker
+
+CYCLE_NS = 1_000_000
+"""Time between two paced frames."""
 WINDOW = 2048
 """Frames on their way; the receive buffers of all receivers hold more."""
 BURST = 64
 """Frames between two looks at the window and the clock."""
-_ARRIVED_WITHIN_NS = 500_000_000
+ARRIVED_WITHIN_NS = 500_000_000
+"""A sender waits so long for its last frames."""
 
 
 def answer(message: dict[str, Any]) -> None:
@@ -26,8 +31,13 @@ def wait(seconds: float) -> None:
     select.select([], [], [], seconds)
 
 
-def send_for(seconds: float, send_burst: Callable[[], None], arrived: Callable[[], int]) -> float:
-    """Send bursts of BURST frames, at most WINDOW frames ahead of what *arrived* counts.
+def send_for(
+    seconds: float,
+    send_burst: Callable[[], None],
+    arrived: Callable[[], int],
+    window: int = WINDOW,
+) -> float:
+    """Send bursts of BURST frames, at most *window* frames ahead of what *arrived* counts.
 
     Returns:
         Seconds from the first frame sent to the last one arrived.
@@ -36,9 +46,20 @@ def send_for(seconds: float, send_burst: Callable[[], None], arrived: Callable[[
     end_ns = start_ns + int(seconds * 1e9)
     sent = 0
     while monotonic_ns() < end_ns:
-        if sent - arrived() < WINDOW:
+        if sent - arrived() < window:
             send_burst()
             sent += BURST
-    while arrived() < sent and monotonic_ns() < end_ns + _ARRIVED_WITHIN_NS:
+    while arrived() < sent and monotonic_ns() < end_ns + ARRIVED_WITHIN_NS:
         pass
     return (monotonic_ns() - start_ns) / 1e9
+
+
+def send_stamps(seconds: float, send: Callable[[int], object]) -> None:
+    """Call *send* with the time just before it, once each millisecond; answer with the number."""
+    ticker, due_ns, count = Ticker(), monotonic_ns(), int(seconds * 1e9 / CYCLE_NS)
+    for _ in range(count):
+        due_ns += CYCLE_NS
+        while not ticker.wait(due_ns):
+            pass
+        send(monotonic_ns())
+    answer({"sent": count})

@@ -12,16 +12,20 @@ CONTROL = "control"
 _TIMEOUT_MS = 200
 
 
-def line(islands: int, cycle_us: int) -> bytes:
+def line(islands: int, cycle_us: int, *, generated: bool = True) -> bytes:
     """Return a plant of *islands* in a line, and a control station that talks to each of them.
 
-    Neighbours send each other 600 octets, islands and control 1024.  JSON is YAML, too.
+    Neighbours send each other 600 octets, islands and control 1024.  JSON is YAML, too.  Unless
+    they are *generated*, values stay as the application writes them.
     """
-    stations = [_island(number, islands) for number in range(1, islands + 1)]
+    stations = [*(_island(number, islands) for number in range(1, islands + 1)), _control(islands)]
+    if not generated:
+        for station in stations:
+            del station["sources"]
     plant = {
         "plant": f"line-{islands}",
         "defaults": {"cycle_us": cycle_us},
-        "stations": [*stations, _control(islands)],
+        "stations": stations,
     }
     return msgspec.json.format(msgspec.json.encode(plant))
 

@@ -8,13 +8,11 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any
 
-from eap.codec.ethercat import ETHERTYPE, EtherCatHeader
+from eap.codec.ethercat import ETHERTYPE
 from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PdHeader
-from eap.ids import MacAddr
-from eap.net.ticker import Ticker
 from tools.bench.network import Page
-from tools.bench.pacing import BURST, answer, send_for
-from tools.bench.stations import CYCLE_US, DESTINATION, ETHERNET_HEADER, Shape
+from tools.bench.pacing import BURST, answer, send_for, send_stamps
+from tools.bench.stations import ETHERNET_HEADER, Shape, frame_octets
 from tools.bench.timing import Latencies
 
 _RECEIVE_BUFFER = 8 << 20
@@ -30,7 +28,7 @@ _STAMP_AT = ETHERNET_HEADER + FIRST_PD + PdHeader.SIZE
 def send(job: dict[str, Any]) -> None:
     """Patch the counter in one buffer and ``send`` it, again and again."""
     words = Page(Path(job["page"])).words
-    buffer, put, cycle = _frame(job), _CYCLE.pack_into, 0
+    buffer, put, cycle = bytearray(frame_octets(Shape(**job["shape"]))), _CYCLE.pack_into, 0
     with _open(job["interface"]) as sock:
         transmit = sock.send
 
@@ -46,12 +44,10 @@ def send(job: dict[str, Any]) -> None:
 
 
 def receive(job: dict[str, Any]) -> None:
-    """``recv_into`` one buffer, unpack the counter and compare it; *spin* never sleeps."""
+    """``recv_into`` one buffer, unpack the counter and compare it."""
     words = Page(Path(job["page"])).words
     buffer, get, received, lost, last = bytearray(2048), _CYCLE.unpack_from, 0, 0, 0
     with _open(job["interface"]) as sock:
-        if job["spin"]:
-            sock.setblocking(False)
         take = sock.recv_into
         answer({"ready": True})
         while not words[Page.STOP]:
@@ -71,16 +67,14 @@ def receive(job: dict[str, Any]) -> None:
 
 def send_paced(job: dict[str, Any]) -> None:
     """Send one frame a cycle; its data begins with the time just before."""
-    buffer, put, ticker = _frame(job), _STAMP.pack_into, Ticker()
-    due_ns, count = monotonic_ns(), int(job["seconds"] * 1e6 / CYCLE_US)
+    buffer, put = bytearray(frame_octets(Shape(**job["shape"]))), _STAMP.pack_into
     with _open(job["interface"]) as sock:
-        for _ in range(count):
-            due_ns += CYCLE_US * 1000
-            while not ticker.wait(due_ns):
-                pass
-            put(buffer, _STAMP_AT, monotonic_ns())
+
+        def send_at(now_ns: int) -> None:
+            put(buffer, _STAMP_AT, now_ns)
             sock.send(buffer)
-    answer({"sent": count})
+
+        send_stamps(job["seconds"], send_at)
 
 
 def receive_stamps(job: dict[str, Any]) -> None:
@@ -109,10 +103,3 @@ def _open(interface: str) -> socket.socket:
     patience = struct.pack("@ll", 0, _LOOK_UP_US)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, patience)
     return sock
-
-
-def _frame(job: dict[str, Any]) -> bytearray:
-    size = Shape(**job["shape"]).frame_size
-    header = MacAddr.parse(DESTINATION) + bytes(6) + ETHERTYPE.to_bytes(2)
-    ethercat = EtherCatHeader(size - EtherCatHeader.SIZE).encode()
-    return bytearray(header + ethercat + bytes(size - EtherCatHeader.SIZE))

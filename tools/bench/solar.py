@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from os import geteuid
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from tools.bench import machine
-from tools.bench.appliance import PROCESSES, observe
+from tools.bench.appliance import PROCESSES, Observation, observe
 from tools.bench.figures import Figure, at_most, report
 from tools.bench.network import ROOT, cable
+from tools.bench.plants import line
 from tools.bench.settings import Settings
 
 TITLE = "solar-line: 15 stations, 54 PDs of 600 and 1024 bytes, every 10 ms, one engine process"
+ISLANDS, CYCLE_US = 14, 10_000
+"""Of the plant that is delivered."""
 PLANT = ROOT / "config" / "solar-line.yaml"
 _MEGA = 1 << 20
 
@@ -19,18 +24,31 @@ _MEGA = 1 << 20
 def run(settings: Settings) -> list[Figure]:
     """Run the plant that is delivered; as root in a namespace of its own."""
     machine.require_cores()
-    settings.tell(f"solar-line for {settings.solar_s:.0f} s")
-    with cable() if geteuid() == 0 else nullcontext() as link:
+    settings.tell(f"solar-line for {settings.solar_s:.0f} s, with generated values and without")
+    with (
+        cable() if geteuid() == 0 else nullcontext() as link,
+        TemporaryDirectory(dir=machine.memory_folder()) as folder,
+    ):
         seen = observe(PLANT, settings.solar_s, link)
+        path = Path(folder, "still.yaml")
+        path.write_bytes(line(ISLANDS, CYCLE_US, generated=False))
+        still = observe(path, settings.solar_s, link)
     memory = ", ".join(f"{name} {seen.rss[name] / _MEGA:.0f} MB" for name in PROCESSES)
     share = ", ".join(f"{name} {seen.cpu[name]:.1%}" for name in PROCESSES[::2])
     late = ", ".join(f"{key} {value} µs" for key, value in seen.lateness_us.items())
     return [
         at_most("frames lost", seen.lost, 0, " ", f"of {seen.received} received"),
-        at_most("engine, share of one core", seen.cpu["engine"] * 100, 15, " %"),
+        at_most("solar line: engine, share of one core", seen.cpu["engine"] * 100, 8, " %",
+                limit=_of_kernel(seen)),
+        at_most("solar line without generated values: engine, share of one core",
+                still.cpu["engine"] * 100, 5, " %", limit=_of_kernel(still)),
         at_most("engine, resident memory", seen.rss["engine"] / _MEGA, 60, " MB"),
         report("resident memory of each process", memory),
         report("the other processes, share of one core", share),
         report("lateness of the worst station", late),
         report("cycles left out", f"{seen.overruns} of {seen.cycles}", seen.overruns),
-    ]
+    ]  # fmt: skip
+
+
+def _of_kernel(seen: Observation) -> str:
+    return f"the kernel's part of it: {seen.kernel['engine'] * 100:.1f} %"

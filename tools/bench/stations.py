@@ -8,7 +8,8 @@ from pathlib import Path
 
 import msgspec
 
-from eap.ids import InterfaceUri, NetId
+from eap.codec.ethercat import ETHERTYPE, EtherCatHeader
+from eap.ids import InterfaceUri, MacAddr, NetId
 from eap.net.ethernet import EthernetInterface, EthernetPort, packet_batch
 from eap.net.image_file import ImageFile, create_image
 from eap.net.packetsocket import open_packet_pair
@@ -148,6 +149,13 @@ def assemble(spec: StationSpec, folder: Path, interface: str) -> Iterator[Assemb
         port = opened.port(station.handlers["eap0"])
         station.connect("eap0", port)
         yield Assembled(file, station, port)
+
+
+def frame_octets(shape: Shape) -> bytes:
+    """Return an Ethernet frame of *shape* as raw loops send it: its headers, and zeros."""
+    header = MacAddr.parse(DESTINATION) + bytes(6) + ETHERTYPE.to_bytes(2)
+    ethercat = EtherCatHeader(shape.frame_size - EtherCatHeader.SIZE).encode()
+    return header + ethercat + bytes(shape.frame_size - EtherCatHeader.SIZE)
 
 
 def frames_sent(image: Image) -> int:

@@ -61,6 +61,20 @@ def test_markdown_table_has_a_row_for_each_figure() -> None:
     assert rows[2:] == ["| memory | ≤ 60 MB | 33.4 MB | ok |"]
 
 
+def test_tables_show_limits_where_they_are_wanted() -> None:
+    figure = at_least(
+        "stations", 85, 300, "76 %", unit=" stations", limit="at 113 some cycles lost"
+    )
+    assert figure.measured == "85 stations (76 %)"
+    assert markdown_table([figure], limits=True).splitlines() == [
+        "| figure | target | measured | result | limit |",
+        "|---|---|---|---|---|",
+        "| stations | ≥ 300 stations | 85 stations (76 %) | missed | at 113 some cycles lost |",
+    ]
+    assert "limit" not in text_table([figure])
+    assert text_table([figure], limits=True).splitlines()[2].endswith("at 113 some cycles lost")
+
+
 def test_replace_between_keeps_everything_outside() -> None:
     assert replace_between("a <b> old <e> z", "<b>", "<e>", "new") == "a <b>\nnew\n<e> z"
 

@@ -1,0 +1,64 @@
+"""The demo plant: time until it is ready, processor time and memory of all its processes."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from os import geteuid
+from statistics import median
+from time import perf_counter
+
+from tools.bench import machine
+from tools.bench.appliance import PROCESSES, Observation, observe, running
+from tools.bench.figures import Figure, at_most, report
+from tools.bench.network import ROOT, Cable, cable
+from tools.bench.settings import Settings
+
+TITLE = "Demo plant: 3 stations, 3 buses of simulated slaves, page; 10 ms"
+PLANT = ROOT / "config" / "demo.yaml"
+_MEGA = 1 << 20
+_OTHERS = "web"
+RSS_BEFORE_MB = 105
+"""Supervisor, engine and services before the cyclic path was compiled."""
+
+
+def run(settings: Settings) -> list[Figure]:
+    """Start the plant several times, then observe it."""
+    machine.require_cores()
+    with cable() if geteuid() == 0 else nullcontext() as link:
+        ready_s = []
+        for number in range(settings.rounds):
+            settings.tell(f"start of the demo plant, {number + 1} of {settings.rounds}")
+            ready_s.append(_start(link))
+        settings.tell(f"demo plant for {settings.solar_s:.0f} s")
+        seen = observe(PLANT, settings.solar_s, link)
+    return figures_of(ready_s, seen)
+
+
+def figures_of(ready_s: list[float], seen: Observation) -> list[Figure]:
+    """Return the figures of several starts and of one observation."""
+    segments = [name for name in seen.cpu if name not in {*PROCESSES, _OTHERS}]
+    dearest = max(segments, key=lambda name: seen.cpu[name])
+    rss = {name: octets / _MEGA for name, octets in seen.rss.items()}
+    own = sum(rss[name] for name in PROCESSES)
+    listed = ", ".join(f"{name} {rss[name]:.0f}" for name in rss)
+    engine, segment = (seen.cpu[name] * 100 for name in ("engine", dearest))
+    in_kernel = [
+        f"the kernel's part of it: {seen.kernel[n] * 100:.1f} %" for n in ("engine", dearest)
+    ]
+    return [
+        at_most("demo: plant ready", median(ready_s), 1.5, " s", f"longest {max(ready_s):.2f} s",
+                limit="start of four interpreters and their imports"),
+        at_most("demo: engine, share of one core", engine, 5, " %", limit=in_kernel[0]),
+        at_most("demo: each segment, share of one core", segment, 2, " %", limit=in_kernel[1]),
+        at_most("demo: resident memory of supervisor, engine and services", own, RSS_BEFORE_MB,
+                " MB", limit="before: 105 MB, and the segments"),
+        report("demo: resident memory of all processes", f"{sum(rss.values()):.0f} MB ({listed})",
+               sum(rss.values())),
+    ]  # fmt: skip
+
+
+def _start(link: Cable | None) -> float:
+    """Return seconds from the start of the command to its message that the plant is ready."""
+    begin = perf_counter()
+    with running(PLANT, link):
+        return perf_counter() - begin
