@@ -21,8 +21,7 @@ from eap.ids import NetId
 from eap.quantities import count
 
 if TYPE_CHECKING:
-    from eap.ops.discover import DiscoveredPd, ObserverFeed
-    from eap.ops.takers import Taker
+    from eap.ops.discover import DiscoveredPd, ObserverFeed, Taker
 
 _USUAL_S = 5.0
 """Length of a capture whose result goes to a file, a pipe or a plant file."""
@@ -147,7 +146,7 @@ def _check_usage(
 
 def _takers(plants: tuple[Path, ...]) -> list[Taker]:
     """Return the subscriptions of running stations and of plant files."""
-    from eap.ops.takers import running_stations, takers_of
+    from eap.ops.discover import running_stations, takers_of
 
     stations, errors = running_stations()
     for error in errors:

@@ -203,7 +203,7 @@ def _copy_example(
     example: str, name: str | None, file: Path, output: Renderer, *, force: bool
 ) -> None:
     """Write the files of an example; those that are there already with this content stay."""
-    from eap.config.examples import CopiedExample, read_example
+    from eap.config.new_plant import CopiedExample, read_example
     from eap.pd.rules import plant_name_of
     from eap.runtime.durable import whole_file
 

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from eap.ams.mqtt.messages import check_network
 from eap.ams.spec import MqttSpec, TlsSpec, TransportKind
+from eap.config.bridge_sections import MqttSection
 from eap.config.files import check_file, whole_path
 from eap.config.finding import FindingReport, PlantFinding
 from eap.config.index import Index
-from eap.config.mqtt_sections import MqttSection
 from eap.config.structs import RouteSection, StationSection, TlsSection
 from eap.ids import parse_host
 from eap.suggest import suggest

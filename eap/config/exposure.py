@@ -14,12 +14,11 @@ import msgspec
 
 from eap.ams.spec import AccessService, TransportKind
 from eap.config.access import ALL, parse_services, rule_name
+from eap.config.bridge_sections import FieldServerSection, ModbusSection, MqttSection, S7Section
 from eap.config.brokers import brokers_of, parse_url
-from eap.config.field_sections import FieldServerSection, ModbusSection, S7Section
 from eap.config.finding import FindingReport
 from eap.config.index import Index
 from eap.config.listen import parse_listen
-from eap.config.mqtt_sections import MqttSection
 from eap.config.opcua_sections import ChannelSecurity, ClientTrust
 from eap.config.structs import (
     ANY_SOURCE,

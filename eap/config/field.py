@@ -26,7 +26,7 @@ from eap.codec.fieldaddresses import (
 )
 from eap.codec.fieldtypes import FieldType, aligned, coil_type, modbus_type, s7_type
 from eap.codec.modbus import ModbusTable
-from eap.config.field_sections import (
+from eap.config.bridge_sections import (
     ControllerSection,
     FieldServer,
     FieldServerSection,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from eap.config.field_sections import ModbusSection, S7Section
-from eap.config.mqtt_sections import MqttSection
+from eap.config.bridge_sections import ModbusSection, MqttSection, S7Section
 from eap.config.opcua_sections import OpcUaSection
 from eap.config.record_sections import RecordSection
 from eap.config.structs import Defaults, PlantAccess, Section, StationSection, TypeSection

@@ -2,6 +2,6 @@
 
 ``requests`` decodes destinations and operations of requests and encodes error answers;
 ``error_table`` relates the error codes of all protocols; ``request_tracker`` limits clients;
-``dialect`` is the codec of the dialect.  ``client`` and ``async_client`` are clients of any
+``dialect`` is the codec of the dialect.  ``client`` has the clients of any
 gateway, with ``conversations`` as their common core and ``slaves`` to read the slaves of a master.
 """

@@ -12,8 +12,8 @@ import msgspec
 from eap.codec import datatypes
 from eap.codec.datatypes import find_variable
 from eap.codec.fieldaddresses import FieldPoint, place_text
+from eap.config.bridge_sections import ModbusBridge, S7Bridge
 from eap.config.field import address_point, served_point
-from eap.config.field_sections import ModbusBridge, S7Bridge
 from eap.config.load import Plant
 from eap.errors import ConfigError
 from eap.pd.spec import FieldSource, StationSpec, Target, VariableSpec

@@ -12,10 +12,11 @@ the plant is changed and the image gets a new layout, the program moves there by
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from enum import Enum
 from pathlib import Path
 from time import monotonic_ns, time_ns
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from eap.closeable import Closeable
 from eap.errors import EngineGoneError, ImageError, WriterConflictError
@@ -27,7 +28,6 @@ from eap.pd.spec import Writer
 from eap.pd.txframe import EVENT_BIT
 from eap.pd.words import StationWord
 from eap.runtime.folder import describe_roots, find_running
-from eap.runtime.records import to_record
 
 T = TypeVar("T")
 
@@ -192,3 +192,40 @@ def attach(station: str, *, plant: str = "") -> AttachedStation:
         plants = ", ".join(info.plant for _, info in found)
         raise ImageError(f"station {station} runs in {plants}: choose one with plant=")
     return AttachedStation(found[0][0].image(station))
+
+
+def to_record(value: Any, kind: type[T]) -> T:
+    """Return the value of a struct as *kind*, whose fields have the names of members.
+
+    Members without a field are left out.  A field of another record, of an ``Enum``, or of a list
+    or tuple of these is converted; every other value is taken as it is.
+
+    Raises:
+        ValueError: *kind* is no record, or has a field without a member.
+    """
+    names = _field_names(kind)
+    if names is None or not isinstance(value, dict):
+        expected = "a struct for a dataclass or msgspec record"
+        raise ValueError(f"{value!r:.60} as {kind.__name__}: expected {expected}")
+    missing = [name for name in names if name not in value]
+    if missing:
+        known = ", ".join(value)
+        raise ValueError(f"{kind.__name__} has a field {missing[0]!r}: expected one of {known}")
+    hints = get_type_hints(kind)
+    return kind(**{name: _converted(value[name], hints[name]) for name in names})
+
+
+def _field_names(kind: Any) -> Iterable[str] | None:
+    fields: Iterable[str] | None = getattr(kind, "__dataclass_fields__", None)
+    return getattr(kind, "__struct_fields__", None) if fields is None else fields
+
+
+def _converted(value: Any, hint: Any) -> Any:
+    if isinstance(value, tuple):
+        items = get_args(hint)
+        item = items[0] if items else Any
+        elements = [_converted(each, item) for each in value]
+        return elements if get_origin(hint) is list else tuple(elements)
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return hint(int(value))
+    return value if _field_names(hint) is None else to_record(value, hint)

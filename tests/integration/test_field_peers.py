@@ -20,7 +20,7 @@ from eap.bridges.modbus.link import ModbusLink
 from eap.bridges.modbus.session import ModbusSession
 from eap.codec import datatypes
 from eap.codec.fieldaddresses import modbus_point
-from eap.config.field_sections import FieldServer, ModbusController, ServedItem
+from eap.config.bridge_sections import FieldServer, ModbusController, ServedItem
 from eap.errors import EnvironmentalError
 from eap.live.client import LiveClient
 from eap.live.transport import PlantConnection, gone

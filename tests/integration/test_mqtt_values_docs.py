@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.config.mqtt_sections import MqttBridgeSpec
+from eap.config.bridge_sections import MqttBridgeSpec
 from eap.runtime.plantfile import load_plant
 from tests.support.eventually import wait_until
 from tests.support.mosquitto import broker

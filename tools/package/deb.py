@@ -26,8 +26,7 @@ from pathlib import Path
 from click.shell_completion import get_completion_class
 
 from eap.cli.group import main as eapctl
-from eap.config.examples import read_example
-from eap.config.new_plant import SCHEMA
+from eap.config.new_plant import SCHEMA, read_example
 from tools.package import manpages, sbom
 from tools.package.version import ROOT, commit_time
 

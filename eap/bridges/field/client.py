@@ -15,7 +15,7 @@ from eap.bridges.field.plan import PointKey, ReadPlan, ReadSpan, batches, bytes_
 from eap.bridges.field.protocol import FieldConversation, FieldLink, FieldLinkError, ResultT
 from eap.codec.datatypes import with_nan
 from eap.codec.fieldaddresses import FieldPoint
-from eap.config.field_sections import ControllerSection
+from eap.config.bridge_sections import ControllerSection
 from eap.control.field import FILL
 from eap.errors import CodecError, EapError
 from eap.net.reconnecting import Backoff

@@ -18,8 +18,8 @@ from eap.bridges.field.protocol import FieldLink, FieldSession
 from eap.bridges.field.server import FieldServing
 from eap.codec import datatypes
 from eap.codec.fieldaddresses import FieldPoint
+from eap.config.bridge_sections import FieldServer, ModbusController, S7Controller
 from eap.config.field import address_point
-from eap.config.field_sections import FieldServer, ModbusController, S7Controller
 from eap.control.field import FIELD_POINTS, FieldPointRow
 from eap.errors import EapError
 from eap.runtime.bridges import PeerStatus

@@ -15,8 +15,8 @@ from eap.bridges.bridge import Bridge
 from eap.bridges.feed import Sample
 from eap.bridges.field.memory import ServedMemory, ServedPoint
 from eap.bridges.field.protocol import FieldSession
+from eap.config.bridge_sections import FieldServer
 from eap.config.field import served_point
-from eap.config.field_sections import FieldServer
 from eap.config.listen import parse_listen
 from eap.errors import CodecError, EapError, EnvironmentalError
 

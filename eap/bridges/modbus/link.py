@@ -21,7 +21,7 @@ from eap.codec.modbus import (
     frame_length,
     write_request,
 )
-from eap.config.field_sections import ModbusController
+from eap.config.bridge_sections import ModbusController
 
 
 class ModbusLink:

@@ -8,7 +8,7 @@ from eap.bridges.field.process import run_field
 from eap.bridges.modbus.link import ModbusLink
 from eap.bridges.modbus.session import ModbusSession
 from eap.bridges.process import run_bridge
-from eap.config.field_sections import ModbusBridge
+from eap.config.bridge_sections import ModbusBridge
 from eap.runtime.startup import Startup
 
 

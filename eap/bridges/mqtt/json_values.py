@@ -23,7 +23,7 @@ from eap.bridges.mqtt.topics import (
 from eap.codec import datatypes
 from eap.codec.enumerations import Enumeration
 from eap.codec.structures import Structure
-from eap.config.mqtt_sections import MqttSection
+from eap.config.bridge_sections import MqttSection
 from eap.config.selection import match_names
 
 ONLINE, OFFLINE = b"online", b"offline"

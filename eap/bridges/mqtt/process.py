@@ -18,7 +18,7 @@ from eap.bridges.mqtt.json_values import JsonValues
 from eap.bridges.mqtt.sparkplug_node import SparkplugNode
 from eap.bridges.mqtt.topics import CommandError, MessageCore, WriteCommand, level
 from eap.bridges.process import run_bridge
-from eap.config.mqtt_sections import MqttBridgeSpec
+from eap.config.bridge_sections import MqttBridgeSpec
 from eap.errors import EapError
 from eap.net.mqtt import Handlers, MqttLink
 from eap.runtime.startup import Startup

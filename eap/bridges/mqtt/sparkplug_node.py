@@ -24,7 +24,7 @@ from eap.bridges.mqtt.topics import (
 from eap.codec import datatypes
 from eap.codec.basetypes import DataType
 from eap.codec.sparkplug import Metric, MetricType, decode_payload, encode_payload
-from eap.config.mqtt_sections import MqttSection, SparkplugSection
+from eap.config.bridge_sections import MqttSection, SparkplugSection
 from eap.config.selection import match_names
 from eap.errors import CodecError
 

@@ -31,7 +31,7 @@ from eap.codec.s7 import (
     encode_setup,
     packet_length,
 )
-from eap.config.field_sections import S7Controller
+from eap.config.bridge_sections import S7Controller
 
 WANTED_PDU = 960
 """Largest PDU of any controller."""

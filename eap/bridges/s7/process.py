@@ -7,7 +7,7 @@ from eap.bridges.field.process import run_field
 from eap.bridges.process import run_bridge
 from eap.bridges.s7.link import S7Link
 from eap.bridges.s7.session import S7Session
-from eap.config.field_sections import S7Bridge
+from eap.config.bridge_sections import S7Bridge
 from eap.runtime.startup import Startup
 
 

@@ -17,7 +17,7 @@ from eap.bridges.s7.session import S7Session
 from eap.codec import datatypes
 from eap.codec.fieldaddresses import modbus_point, s7_point
 from eap.codec.fieldtypes import FieldType, modbus_type, s7_type
-from eap.config.field_sections import ModbusController, S7Controller
+from eap.config.bridge_sections import ModbusController, S7Controller
 from eap.errors import CodecError
 from tools.fuzz.messages import cut
 

@@ -16,7 +16,7 @@ from eap.codec.sparkplug import (
     Template,
     encode_payload,
 )
-from eap.config.mqtt_sections import MqttSection, SparkplugSection
+from eap.config.bridge_sections import MqttSection, SparkplugSection
 from tools.fuzz.messages import cut
 
 _TYPES = {

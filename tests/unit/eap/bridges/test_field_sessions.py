@@ -30,7 +30,7 @@ from eap.codec.s7 import (
     encode_data,
     encode_items,
 )
-from eap.config.field_sections import ModbusController, S7Controller
+from eap.config.bridge_sections import ModbusController, S7Controller
 from eap.errors import CodecError
 
 S7 = {

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from eap.cli.group import main
-from eap.config.examples import example_names
+from eap.config.new_plant import example_names
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from eap.config.field_sections import FieldServer, ModbusBridge, S7Bridge
+from eap.config.bridge_sections import FieldServer, ModbusBridge, S7Bridge
 from eap.config.index import ExpectedBus
 from eap.config.load import Plant, PlantResult, load
 from eap.pd.spec import S7Source, S7Target, Substitute, Writer

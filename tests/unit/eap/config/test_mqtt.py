@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from eap.config.mqtt_sections import MqttBridgeSpec
+from eap.config.bridge_sections import MqttBridgeSpec
 from eap.runtime.plantfile import load_plant
 
 PLANT = """\

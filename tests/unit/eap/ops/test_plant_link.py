@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from eap.config.bridge_sections import MqttSection
 from eap.config.load import Plant
-from eap.config.mqtt_sections import MqttSection
 from eap.config.web_sections import MetricsSection, WebSection
 from eap.errors import ControlError
 from eap.ops.plant import StationPlan, link_to

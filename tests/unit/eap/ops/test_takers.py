@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from eap.ids import InterfaceUri, NetId
-from eap.ops.takers import takers_of
+from eap.ops.discover import takers_of
 from eap.pd.observer import ObservedPdKey
 from eap.pd.spec import RxAlternateSpec, RxPdSpec, SentVariableSpec
 from eap.pd.words import PdDropReason

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from eap.codec.datatypes import parse
-from eap.runtime.records import to_record
+from eap.runtime.attach import to_record
 
 AXIS = parse(
     "S<24/4:a@0 INT,e@2 E<INT:Off=0,On=1>,p@4 P<8/4:x@0 REAL,y@4 REAL>,q@12 INT[2],r@16 P[1]>"

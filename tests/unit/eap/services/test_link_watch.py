@@ -6,7 +6,7 @@ import asyncio
 
 from eap.ams.transport_table import Transport
 from eap.ids import Endpoint
-from eap.services.transports.link_watch import LinkWatch
+from eap.services.network import LinkWatch
 from tests.support.eventually import eventually, settle
 from tests.support.routing import RecordingSender, station, while_serving
 from tests.support.virtualtime import run_virtual

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import math
 
-from eap.web.history import MAX_POINTS, VariableHistory
+from eap.web.topics import MAX_POINTS, VariableHistory
 
 
 def test_peak_of_one_sample_is_kept():

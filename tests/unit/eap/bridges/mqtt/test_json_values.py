@@ -11,7 +11,7 @@ from eap.ams.mqtt.network import Publish, Subscribe
 from eap.bridges.feed import BridgeVariable, Quality, Sample
 from eap.bridges.mqtt.json_values import JsonValues
 from eap.bridges.mqtt.topics import CommandError, WriteCommand
-from eap.config.mqtt_sections import MqttPublish, MqttSection
+from eap.config.bridge_sections import MqttPublish, MqttSection
 
 AT_NS = 1_700_000_000_123_400_000
 AT_S = 1700000000.123

@@ -18,7 +18,7 @@ from eap.codec.sparkplug import (
     decode_payload,
     encode_payload,
 )
-from eap.config.mqtt_sections import MqttPublish, MqttSection, SparkplugSection
+from eap.config.bridge_sections import MqttPublish, MqttSection, SparkplugSection
 
 AT_NS = 1_700_000_000_000_000_000
 AXIS = "Axis<8/4:pos@0 REAL,on@4 BOOL8>"

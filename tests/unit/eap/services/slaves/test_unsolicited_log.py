@@ -5,7 +5,7 @@ import pytest
 from devicebus.master.mailboxes import Unsolicited
 from eap.codec.mailbox import MailboxType
 from eap.runtime.engine_messages import UnsolicitedMessage
-from eap.services.slaves.unsolicited_log import log_unsolicited_pdos
+from eap.services.local_bus import log_unsolicited_pdos
 from tests.support.busads import play, until
 
 
