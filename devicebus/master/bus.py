@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, TypeAlias
 
 import msgspec
@@ -21,7 +20,6 @@ from devicebus.master.procedure import Runner, Task
 from devicebus.master.ring import RING_INDEXES, Ring
 from devicebus.master.scan import FIRST_STATION, FoundSlave
 from devicebus.wire.alstatus import AlState
-from devicebus.wire.datagram import DatagramReply
 from eap.codec.mailbox import MailboxType
 from eap.od.slave_config import SlaveConfig
 
@@ -355,7 +353,7 @@ class BusState:
         if self.cycle is not None:
             self.cycle.extra = [] if reference is None else [drift_datagram(reference)]
             if self.lock is not None:
-                self.cycle.handle_extra = partial(_note_time, self.lock)
+                self.cycle.note_time = self.lock.note
         if self.lock is not None and reference is None:
             self.lock.hold()
         self.locate_cut()
@@ -424,10 +422,3 @@ def _make_lock(settings: MasterSettings) -> CycleLock:
     signals = [found for each in syncs if (found := each.signals(settings.cycle_ns)) is not None]
     shift_ns = min((each.shift0_ns for each in signals), default=0)
     return CycleLock(settings.cycle_ns, settings.lead_ns, shift_ns)
-
-
-def _note_time(lock: CycleLock, replies: Sequence[DatagramReply], now_ns: int) -> None:
-    """Give the lock the time that the reference clock has put into the datagram."""
-    for reply in replies[:1]:
-        if reply.wkc:
-            lock.note(int.from_bytes(reply.data, "little"), now_ns)

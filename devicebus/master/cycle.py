@@ -7,16 +7,17 @@ until it is lost, so that the inputs of the others stay valid without it.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from enum import Enum, auto
 from typing import NamedTuple
 
 import msgspec
 
-from devicebus.master.cyclicframe import CyclicExchange, prepare_frames
+from devicebus.master.cyclicframe import CyclicExchange, PreparedFrame, prepare_frames
 from devicebus.master.image import BusImage, DatagramGroup, SlaveLayout
 from devicebus.master.link import Link
-from devicebus.wire.datagram import Command, DatagramReply, DatagramRequest, logical
+from devicebus.wire.datagram import OVERHEAD, Command, DatagramRequest, logical
+from devicebus.wire.register import SmStatus
 
 # More cycles in flight would only delay the later ones, and acyclic frames too.
 MAX_UNDER_WAY = 2
@@ -88,7 +89,7 @@ class Cycle:
 
     Attributes:
         is_good: True if the last cycle has come back with the expected working counters.
-        handle_extra: Receives the replies of the extra datagrams of each cycle.
+        note_time: Called with the time that the first extra datagram brought, and the present one.
     """
 
     def __init__(
@@ -97,7 +98,7 @@ class Cycle:
         self._link = link
         self._image = image
         self._on_fault = on_fault
-        self.handle_extra: Callable[[Sequence[DatagramReply], int], None] | None = None
+        self.note_time: Callable[[int, int], None] | None = None
         self._participation = dict.fromkeys(image.layout.slaves, Participation.ABSENT)
         self._datagrams = tuple(
             datagram
@@ -115,7 +116,10 @@ class Cycle:
         for number in range(len(self._members)):
             self._update_expected(number)
         self.is_good = False
-        self.extra = ()
+        self._extra: Sequence[DatagramRequest] = ()
+        self._looks: Sequence[DatagramRequest] = ()
+        self._note_full: Callable[[int, int], None] | None = None
+        self._prepare()
         self._under_way: deque[CyclicExchange] = deque()
         self._newest = 0
         self._cycles = self._good = self._wkc_errors = 0
@@ -129,20 +133,47 @@ class Cycle:
 
     @extra.setter
     def extra(self, datagrams: Sequence[DatagramRequest]) -> None:
-        """Prepare the frames of the next cycles; those that are under way stay as they are."""
         self._extra = datagrams
-        self._frames = prepare_frames([*map(self._request, self._datagrams), *datagrams])
+        self._prepare()
+
+    def set_looks(
+        self, datagrams: Sequence[DatagramRequest], note_full: Callable[[int, int], None]
+    ) -> int:
+        """Have cycles with *looks* take status reads of mailboxes along, as many as fit.
+
+        Args:
+            datagrams: Reads of one byte, the status of the sync manager.
+            note_full: Called with the number of each datagram that found a message, and the time.
+
+        Returns:
+            The number of datagrams that fit.
+        """
+        room, count = 0, 0
+        if self._frames:
+            last = self._frames[-1]
+            room, count = self._link.room_behind(last.size, len(last.places))
+        self._looks = datagrams[: min(count, room // (OVERHEAD + 1))]
+        self._note_full = note_full
+        self._prepare()
+        return len(self._looks)
+
+    def _prepare(self) -> None:
+        """Prepare the frames of the next cycles; those that are under way stay as they are."""
+        requests = [*map(self._request, self._datagrams), *self._extra]
+        self._frames = prepare_frames(requests)
+        self._looking = prepare_frames([*requests, *self._looks]) if self._looks else self._frames
         places = [
             _Reply(number, *place)
-            for number, frame in enumerate(self._frames)
+            for number, frame in enumerate(self._looking)
             for place in frame.places
         ]
         count = len(self._datagrams)
-        self._replies, self._extra_replies = places[:count], places[count:]
+        self._replies, self._extra_replies = places[:count], places[count : len(requests)]
+        self._look_replies = places[len(requests) :]
         self._writes = [
-            self._write_of(datagram, reply)
-            for datagram, reply in zip(self._datagrams, self._replies, strict=True)
-            if datagram.command is not Command.LRD
+            write
+            for frames in (self._frames, self._looking)[: 2 if self._looks else 1]
+            for write in self._writes_of(frames)
         ]
 
     def set_participation(self, station: int, participation: Participation) -> None:
@@ -167,7 +198,7 @@ class Cycle:
                 return bool(counts >> wkc & 1)
         return None
 
-    def start(self, now_ns: int) -> None:
+    def start(self, now_ns: int, *, looks: bool = False) -> None:
         """Queue this cycle's datagrams, unless MAX_UNDER_WAY cycles are in flight."""
         self._link.start_cycle()
         under_way = self._under_way
@@ -183,7 +214,8 @@ class Cycle:
             octets[where] = outputs[what]
         self._cycles += 1
         self.is_good = False
-        exchange = CyclicExchange(self._frames, self._cycles, now_ns, self._allowed, self._finish)
+        frames = self._looking if looks else self._frames
+        exchange = CyclicExchange(frames, self._cycles, now_ns, self._allowed, self._finish)
         self._link.submit_cycle(exchange)
         under_way.append(exchange)
 
@@ -209,12 +241,16 @@ class Cycle:
         size += group.inputs_size if datagram.command is not Command.LWR else 0
         return logical(datagram.command, datagram.address, bytes(size))
 
-    def _write_of(self, datagram: _CyclicDatagram, reply: _Reply) -> tuple[bytearray, slice, slice]:
-        """Return where the outputs of a datagram go, and which of the image they are."""
-        group = self._image.layout.groups[datagram.group]
-        size = group.outputs_size
-        where = slice(reply.start, reply.start + size)
-        return self._frames[reply.frame].octets, where, slice(group.outputs, group.outputs + size)
+    def _writes_of(
+        self, frames: Sequence[PreparedFrame]
+    ) -> Iterator[tuple[bytearray, slice, slice]]:
+        """Yield where the outputs of each datagram go, and which of the image they are."""
+        for datagram, reply in zip(self._datagrams, self._replies, strict=True):
+            if datagram.command is not Command.LRD:
+                group = self._image.layout.groups[datagram.group]
+                where = slice(reply.start, reply.start + group.outputs_size)
+                what = slice(group.outputs, group.outputs + group.outputs_size)
+                yield frames[reply.frame].octets, where, what
 
     def _finish(self, exchange: CyclicExchange, now_ns: int) -> None:
         """Take the replies of a cycle."""
@@ -244,25 +280,28 @@ class Cycle:
             else:
                 is_good = False
         self._received = received
-        if self.handle_extra is not None:
-            self.handle_extra(self._extra_of(exchange), now_ns)
         self.is_good = is_good
         if is_good:
             self._good += 1
         else:
             self._wkc_errors += 1
             self._on_fault(now_ns)
+        self._handle_others(exchange, now_ns)
 
-    def _extra_of(self, exchange: CyclicExchange) -> list[DatagramReply]:
-        """Return the replies of the extra datagrams that *exchange* carried."""
-        if exchange.frames is not self._frames:
-            return []  # they have changed meanwhile
-        return [
-            DatagramReply(data[start:end], data[end] | data[end + 1] << 8)
-            for data, start, end in (
-                (exchange.replies[number], start, end) for number, start, end in self._extra_replies
-            )
-        ]
+    def _handle_others(self, exchange: CyclicExchange, now_ns: int) -> None:
+        """Take the time of the reference clock, and what was found in mailboxes."""
+        if exchange.frames is not self._frames and exchange.frames is not self._looking:
+            return  # other datagrams have gone with that cycle
+        if self.note_time is not None:
+            for number, start, end in self._extra_replies[:1]:
+                data = exchange.replies[number]
+                if data[end] | data[end + 1]:
+                    self.note_time(int.from_bytes(data[start:end], "little"), now_ns)
+        if exchange.frames is self._looking and self._note_full is not None:
+            for at, (number, start, end) in enumerate(self._look_replies):
+                data = exchange.replies[number]
+                if data[start] & SmStatus.MAILBOX_FULL and data[end] | data[end + 1]:
+                    self._note_full(at, now_ns)
 
     def _copy_inputs(self, datagram: _CyclicDatagram, data: bytes, start: int) -> None:
         if datagram.command is Command.LWR:

@@ -295,6 +295,10 @@ class Link:
             _CyclicPart(exchange, number, frame) for number, frame in enumerate(exchange.frames)
         )
 
+    def room_behind(self, size: int, count: int) -> tuple[int, int]:
+        """Return the bytes and datagrams that fit behind *count* datagrams of a cyclic frame."""
+        return min(MAX_BODY + EtherCatHeader.SIZE - size, self._piggyback), MAX_DATAGRAMS - count
+
     def start_cycle(self) -> None:
         """Begin a cycle: refill the budget, less the overdraft of the cycle before."""
         self._max_spent = max(self._max_spent, self._spent)
@@ -420,8 +424,7 @@ class Link:
         items: Sequence[_QueuedDatagram] = ()
         has_credit = self._credit is not None and self._credit > 0
         if self._acyclic and has_credit and not self._cyclic:
-            room = min(MAX_BODY + EtherCatHeader.SIZE - frame.size, self._piggyback)
-            items = self._take(room, MAX_DATAGRAMS - len(frame.places))
+            items = self._take(*self.room_behind(frame.size, len(frame.places)))
         index = self._note_sent(cyclic, items, now_ns)
         if not items:
             return frame.encode(index)

@@ -15,7 +15,7 @@ from devicebus.master.cycle import Cycle, CycleStats
 from devicebus.master.image import BusImage
 from devicebus.master.link import LinkStats
 from devicebus.master.lock import CycleLock
-from devicebus.master.mailboxes import MailboxStats
+from devicebus.master.mailboxes import Mailbox, MailboxStats
 from devicebus.master.procedure import Procedure, Task
 from devicebus.master.ring import Ring, RingEnd
 from devicebus.master.scan import FoundSlave, scan
@@ -25,6 +25,7 @@ from devicebus.master.watch import (
     PortErrorLog,
     poll_error_counters,
     poll_mailboxes,
+    status_read,
     watch,
 )
 from devicebus.wire.alstatus import WITH_MAILBOX, AlState
@@ -35,6 +36,8 @@ T = TypeVar("T")
 
 LOOK_NS = 10_000_000
 """Poll period of idle mailboxes for unsolicited messages."""
+_LOOK_WITHOUT_CYCLES_NS = 4 * LOOK_NS
+"""Time without a cycle that looks into the mailboxes, after which they are looked at without."""
 
 
 class MasterStats(msgspec.Struct, frozen=True):
@@ -60,6 +63,10 @@ class Master:
         self._running: Task[None] | None = None
         self._look_ns = 0
         self._look: Task[None] | None = None
+        self._looks_every = max(1, LOOK_NS // self._bus.settings.cycle_ns)
+        self._cycles_to_look = self._in_cycle = 0
+        self._looked_at: list[Mailbox] = []
+        self._look_cycle: Cycle | None = None
         self.port_errors = PortErrorLog()
         self._errors_ns = 0
         self._copies: list[bytes] = []
@@ -195,8 +202,36 @@ class Master:
 
     def start_cycle(self, now_ns: int) -> None:
         """Exchange process data once, and refill the budget of acyclic datagrams."""
-        if self._bus.cycle is not None:
-            self._bus.cycle.start(now_ns)
+        cycle = self._bus.cycle
+        if cycle is None:
+            return
+        self._cycles_to_look -= 1
+        looks = self._cycles_to_look < 0
+        if looks:
+            self._cycles_to_look = self._looks_every - 1
+            self._look_ns = now_ns + _LOOK_WITHOUT_CYCLES_NS
+            self._place_looks(cycle, now_ns)
+        cycle.start(now_ns, looks=looks)
+
+    def _place_looks(self, cycle: Cycle, now_ns: int) -> None:
+        """Have cycles look into the open mailboxes; those that do not fit have their own frames."""
+        boxes = self._open_mailboxes()
+        if boxes != self._looked_at or cycle is not self._look_cycle:
+            self._looked_at, self._look_cycle = boxes, cycle
+            self._in_cycle = cycle.set_looks([*map(status_read, boxes)], self._note_full)
+        if self._in_cycle < len(boxes):
+            self._look_into(boxes[self._in_cycle :], now_ns)
+
+    def _note_full(self, number: int, now_ns: int) -> None:
+        self._looked_at[number].poll(now_ns)
+
+    def _look_into(self, boxes: Sequence[Mailbox], now_ns: int) -> None:
+        """Look into mailboxes beside the cycle, unless an earlier look is under way."""
+        if self._look is None or self._look.is_done:
+            self._look = self.run(poll_mailboxes(boxes), now_ns, "looking into mailboxes")
+
+    def _open_mailboxes(self) -> list[Mailbox]:
+        return [each.mailbox for each in self._bus.slaves.values() if each.mailbox is not None]
 
     def stop_cycles(self) -> None:
         """End the cyclic operation: acyclic datagrams are sent without a budget."""
@@ -245,8 +280,8 @@ class Master:
         self._bus.runner.handle_timeout(now_ns)
         if now_ns >= self._look_ns:
             self._look_ns = now_ns + LOOK_NS
-            if self._has_mailbox() and (self._look is None or self._look.is_done):
-                self._look = self.run(poll_mailboxes(self._bus), now_ns, "looking into mailboxes")
+            if boxes := self._open_mailboxes():
+                self._look_into(boxes, now_ns)
         if now_ns >= self._errors_ns and self._bus.cycle is not None:
             self._errors_ns = now_ns + ERRORS_PERIOD_NS
             self.run(

@@ -29,7 +29,7 @@ from devicebus.master.bus import (
 from devicebus.master.cycle import Participation
 from devicebus.master.diagnosis import COUNTERS, port_counters
 from devicebus.master.hotconnect import identify_arrivals, refresh_topology, take_in
-from devicebus.master.mailboxes import STATUS
+from devicebus.master.mailboxes import STATUS, Mailbox
 from devicebus.master.procedure import Procedure, Sleep, Task
 from devicebus.master.scan import (
     assign_stations,
@@ -39,7 +39,7 @@ from devicebus.master.scan import (
     read_stations,
 )
 from devicebus.wire.alstatus import ERROR, WITH_PROCESS_DATA, AlState
-from devicebus.wire.datagram import DatagramReply, aprd, fprd, fpwr
+from devicebus.wire.datagram import DatagramReply, DatagramRequest, aprd, fprd, fpwr
 from devicebus.wire.register import AlStatus, Register, SmStatus
 from eap.errors import EapError
 
@@ -47,14 +47,18 @@ from eap.errors import EapError
 _PER_STEP = 15
 
 
-def poll_mailboxes(bus: BusState) -> Procedure[None]:
-    """Poll the idle mailboxes and read the full ones."""
-    idle = [slave.mailbox for slave in bus.slaves.values() if slave.mailbox is not None]
-    idle = [mailbox for mailbox in idle if not mailbox.is_busy]
+def status_read(mailbox: Mailbox) -> DatagramRequest:
+    """Return the datagram that shows whether *mailbox* holds a message."""
+    return fprd(mailbox.station, STATUS, 1, tries=1)
+
+
+def poll_mailboxes(mailboxes: Sequence[Mailbox]) -> Procedure[None]:
+    """Poll the idle ones of *mailboxes* and read the full ones."""
+    idle = [mailbox for mailbox in mailboxes if not mailbox.is_busy]
     for start in range(0, len(idle), _PER_STEP):
         part = idle[start : start + _PER_STEP]
         try:
-            replies, now_ns = yield [fprd(each.station, STATUS, 1, tries=1) for each in part]
+            replies, now_ns = yield [status_read(each) for each in part]
         except FrameLostError:
             continue  # the next look comes soon
         for mailbox, reply in zip(part, replies, strict=True):

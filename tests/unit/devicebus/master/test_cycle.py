@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from devicebus.master.cycle import MAX_UNDER_WAY, Cycle, Participation
+from devicebus.master.cyclicframe import MAX_DATAGRAMS
 from devicebus.master.image import BASE, BusImage, plan_image
 from devicebus.master.link import BACKOFF_LIMIT_NS, LINGER_NS, Link
-from devicebus.wire.datagram import Command, DatagramRequest, frmw
+from devicebus.wire.datagram import Command, DatagramRequest, fprd, frmw
 from tests.support.busline import MS, accesses_of, answer
 from tests.unit.devicebus.master.test_image import shape
 
@@ -144,10 +146,39 @@ def test_more_datagrams_go_with_a_cycle():
     f = Fixture()
     taken = []
     f.cycle.extra = [frmw(1, 0x910, 8)]
-    f.cycle.handle_extra = lambda replies, now_ns: taken.extend(replies)
-    accesses = f.round(7, b"...WXYZ")
+    f.cycle.note_time = lambda time_ns, now_ns: taken.append((time_ns, now_ns))
+    accesses = f.round(7, b"\1\2\0\0\0\0\0")
     assert [each.command for each in accesses] == [Command.LRW, Command.FRMW]
-    assert taken[0].data == b"...WXYZ\0"
+    assert taken == [(0x201, 50)]
+    f.round(0)
+    assert len(taken) == 1  # no clock has put its time there
+
+
+def test_cycle_that_looks_reports_full_mailboxes():
+    f = Fixture()
+    full = []
+    reads = [fprd(station, 0x80D, 1, tries=1) for station in (1, 2, 3)]
+    assert f.cycle.set_looks(reads, lambda number, now_ns: full.append((number, now_ns))) == 3
+    assert len(f.round(7)) == 1
+    f.cycle.start(MS, looks=True)
+    (frame,) = f.link.frames_to_send(MS)
+    assert accesses_of(frame)[1:] == [replace(each, tries=0) for each in reads]
+    back = bytearray(answer(frame, wkc=7))
+    back[-16] = back[-3] = 0x08
+    back[-28:-26] = b"\0\0"
+    f.link.receive_frame(back, MS + 50)
+    assert full == [(1, MS + 50), (2, MS + 50)]
+    assert f.cycle.stats().good == 2
+
+
+def test_cycle_takes_as_many_looks_along_as_fit():
+    f = Fixture()
+    reads = [fprd(station, 0x80D, 1, tries=1) for station in range(20)]
+    assert f.cycle.set_looks(reads, lambda number, now_ns: None) == MAX_DATAGRAMS - 1
+    f.cycle.extra = [frmw(1, 0x910, 8)]
+    f.link._piggyback = 30
+    assert f.cycle.set_looks(reads, lambda number, now_ns: None) == 2
+    assert f.cycle.set_looks([], lambda number, now_ns: None) == 0
 
 
 def test_cycle_without_process_data_sends_nothing():

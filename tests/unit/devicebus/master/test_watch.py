@@ -68,7 +68,7 @@ def test_poll_mailboxes_reports_all_messages(paced):
 
 
 def test_poll_mailboxes_of_17_slaves_takes_two_frames(paced):
-    looking = poll_mailboxes(paced.core._bus)
+    looking = poll_mailboxes(paced.core._open_mailboxes())
     assert len(next(looking)) == 15
     assert len(looking.send(StepReplies([DatagramReply(b"\0", 1)] * 15, 0))) == 2
 
