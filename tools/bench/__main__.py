@@ -30,7 +30,7 @@ from tools.bench.settings import Settings, quick
 
 NAMES = (
     "throughput", "latency", "onestation", "poll", "lateness", "solar", "limits", "demo",
-    "recording", "web", "mqtt", "opcua", "receive", "objects", "change", "routing", "ads",
+    "bus", "recording", "web", "mqtt", "opcua", "receive", "objects", "change", "routing", "ads",
     "gateway", "files", "startup", "acyclic", "cycle", "plantbus", "recovery", "segment",
 )  # fmt: skip
 PAGE = ROOT / "docs" / "performance.md"

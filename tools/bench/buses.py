@@ -41,6 +41,15 @@ def bus(slaves: int, octets: int) -> dict[str, Any]:
     }
 
 
+def plain_bus(slaves: int, octets: int) -> dict[str, Any]:
+    """Return the same without mailboxes: only process data is exchanged in a cycle."""
+    content = bus(slaves, octets)
+    for slave in content["slaves"]:
+        del slave["files"]
+        slave["mailbox"] = None
+    return content
+
+
 def plant(interface: str, cycle_us: int, **more: str) -> dict[str, Any]:
     """Return a plant file of one station, STATION, with one bus port, PORT, at *interface*."""
     port = {"name": PORT, "kind": "bus", "interface": interface, "net_id": "10.134.164.1.3.1"}

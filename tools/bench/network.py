@@ -26,12 +26,14 @@ class Page:
 
     Attributes:
         words: RECEIVED, the reference receiver's count; STOP, set when receivers shall end; JOINED,
-            set when a receiver hears the sender.
+            set when a receiver hears the sender; PHASE, number of the part that a process may
+            begin.
     """
 
     RECEIVED = 0
     STOP = 1
     JOINED = 2
+    PHASE = 3
 
     def __init__(self, path: Path) -> None:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from eap.net.ticker import Ticker
+from tools.bench.network import Page
 
 CYCLE_NS = 1_000_000
 """Time between two paced frames."""
@@ -17,6 +18,8 @@ WINDOW = 2048
 """Frames on their way; the receive buffers of all receivers hold more."""
 BURST = 64
 """Frames between two looks at the window and the clock."""
+_EXCHANGES = 16
+"""Between two looks at the clock."""
 ARRIVED_WITHIN_NS = 500_000_000
 """A sender waits so long for its last frames."""
 
@@ -63,3 +66,27 @@ def send_stamps(seconds: float, send: Callable[[int], object]) -> None:
             pass
         send(monotonic_ns())
     answer({"sent": count})
+
+
+def run_phases(
+    words: memoryview,
+    job: dict[str, Any],
+    exchange: Callable[[], object],
+    good: Callable[[], int],
+) -> list[float]:
+    """Run *exchange* again and again in each phase that begins; return good ones a second.
+
+    The process waits without any exchange before each of *phases*, whose number is set in *words*.
+    """
+    rates = []
+    for phase in range(1, job["phases"] + 1):
+        answer({"ready": True})
+        while words[Page.PHASE] < phase:
+            wait(0.001)
+        begin_ns, before = monotonic_ns(), good()
+        end_ns = begin_ns + int(job["seconds"] * 1e9)
+        while (now_ns := monotonic_ns()) < end_ns:
+            for _ in range(_EXCHANGES):
+                exchange()
+        rates.append((good() - before) / (now_ns - begin_ns) * 1e9)
+    return rates

@@ -2,8 +2,9 @@
  *
  *     rawloop MODE INTERFACE FRAME PAGE SECONDS BATCH
  *
- * MODE: send, receive, send_paced, receive_stamps as in raw_roles.py, or station, which receives and
- * sends one PD each millisecond.  FRAME is a file with an Ethernet frame, PAGE the words that the
+ * MODE: send, receive, send_paced, receive_stamps as in raw_roles.py; station, which receives and
+ * sends one PD each millisecond; exchange, which sends a frame and waits for it, as a master does in
+ * a cycle; or segment, which returns frames as slaves in OP do, their process data unchanged.  FRAME is a file with an Ethernet frame, PAGE the words that the
  * processes share.  With a BATCH above 1 a call of sendmmsg or recvmmsg moves so many frames; with 0
  * a receiver never sleeps.  tools/bench/rawloop.py defines where counter, stamp and data are.
  */
@@ -151,6 +152,48 @@ static void station(double seconds)
            (double)used / (now_ns() - begin), (long long)sent, (long long)received, (long long)lost);
 }
 
+static void exchange(double seconds)
+{
+    int64_t begin = now_ns(), end = begin + (int64_t)(seconds * 1e9), count = 0;
+    while (now_ns() < end) {
+        frames[0][INDEX_AT]++;
+        send(sock, frames[0], size, 0);
+        while (recv(sock, frames[1], ROOM, MSG_DONTWAIT) <= 0 || frames[1][INDEX_AT] != frames[0][INDEX_AT])
+            if (now_ns() > end)
+                break;
+        memcpy(image, frames[1] + DATAGRAM_AT, size - DATAGRAM_AT);
+        count++;
+    }
+    printf("{\"cycles\":%lld,\"seconds\":%f}\n", (long long)count, (now_ns() - begin) / 1e9);
+}
+
+static void segment(void)
+{
+    unsigned char *frame = frames[0];
+    while (!page[STOP]) {
+        int length = recv(sock, frame, ROOM, MSG_DONTWAIT), at = DATAGRAM_AT, more = 1;
+        if (length <= 0)
+            continue;
+        while (more && at + DATAGRAM_HEADER + 2 <= length) {
+            int field = frame[at + 6] | frame[at + 7] << 8, end = at + DATAGRAM_HEADER + (field & 0x7ff);
+            if (end + 2 > length)
+                break;
+            if (frame[at] == LRW) {
+                frame[end] += 3 * SLAVES; /* each reads and writes, ETG.1000.4 */
+            } else if (frame[at] == FPRD || frame[at] == BRD) {
+                frame[end] += frame[at] == BRD ? SLAVES : 1;
+                memset(frame + at + DATAGRAM_HEADER, 0, field & 0x7ff);
+                if ((frame[at + 4] | frame[at + 5] << 8) == AL_STATUS)
+                    frame[at + DATAGRAM_HEADER] = OP;
+            }
+            more = field & 0x8000;
+            at = end + 2;
+        }
+        frame[6] |= 2; /* the first slave does so, ETG.1000.4 */
+        send(sock, frame, length, 0);
+    }
+}
+
 int main(int argc, char **argv)
 {
     if (argc != 7)
@@ -192,5 +235,9 @@ int main(int argc, char **argv)
         receive_stamps();
     else if (!strcmp(mode, "station"))
         station(seconds);
+    else if (!strcmp(mode, "exchange"))
+        exchange(seconds);
+    else if (!strcmp(mode, "segment"))
+        segment();
     return 0;
 }

@@ -11,7 +11,10 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from eap.codec.ethercat import ETHERTYPE
+from devicebus.wire.alstatus import AlState
+from devicebus.wire.datagram import Command, DatagramHeader
+from devicebus.wire.register import Register
+from eap.codec.ethercat import ETHERTYPE, EtherCatHeader
 from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PdHeader
 from tools.bench.network import ROOT, Cable, Worker
 from tools.bench.pacing import ARRIVED_WITHIN_NS, BURST, CYCLE_NS, WINDOW
@@ -23,10 +26,19 @@ PREFIX = "c"
 Process: TypeAlias = AbstractContextManager[Worker]
 _SOURCE = ROOT / "tools" / "bench" / "rawloop.c"
 _PROGRAM = "rawloop"
+SLAVES = 16
+"""Of the segment that the program stands for."""
 _CONSTANTS = {
     "ETHERTYPE": ETHERTYPE,
     "CYCLE_AT": ETHERNET_HEADER + CYCLE_OFFSET,
     "DATA_AT": ETHERNET_HEADER + FIRST_PD + PdHeader.SIZE,
+    "DATAGRAM_AT": ETHERNET_HEADER + EtherCatHeader.SIZE,
+    "DATAGRAM_HEADER": DatagramHeader.SIZE,
+    "INDEX_AT": ETHERNET_HEADER + EtherCatHeader.SIZE + 1,
+    **{command.name: command.value for command in (Command.LRW, Command.FPRD, Command.BRD)},
+    "AL_STATUS": Register.AL_STATUS.value,
+    "OP": AlState.OP.value,
+    "SLAVES": SLAVES,
     "CYCLE_NS": CYCLE_NS,
     "WINDOW": WINDOW,
     "BURST": BURST,
@@ -71,7 +83,7 @@ def raw_loop(
     """
     path = link.folder / f"frame-{side}"
     path.write_bytes(job.get("frame") or frame_octets(Shape(**job["shape"])))
-    words = [mode, job["interface"], str(path), job["page"], str(job["seconds"])]
+    words = [mode, job["interface"], str(path), job["page"], str(job.get("seconds", 0))]
     program = [str(build(link.folder)), *words, str(job.get("batch", 1))]
     worker = Worker(link.command(side, "taskset", "-c", str(cpu), *program))
     try:
