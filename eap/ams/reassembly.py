@@ -47,8 +47,8 @@ _LONGEST_COMMAND = 16
 """Bytes behind the prefix of one."""
 
 
-class AmsStreamDecoder:
-    """Decoder of the AMS packets in one TCP connection.
+class StreamDecoder:
+    """Received bytes of one connection, from which a decoder cuts packets.
 
     It never holds more than one packet of the limit, one prefix, and what came last.
 
@@ -71,6 +71,10 @@ class AmsStreamDecoder:
         skipped = min(self._skip, len(data))
         self._skip -= skipped
         self._buffer += memoryview(data)[skipped:]
+
+
+class AmsStreamDecoder(StreamDecoder):
+    """Decoder of the AMS packets in one TCP connection."""
 
     def receive_one(self, data: bytes) -> bytes | None:
         """Return the packet if *data* is exactly one, as usual; else append *data*."""
@@ -135,24 +139,8 @@ class AmsStreamDecoder:
         return OversizedPacket(header, length)
 
 
-class BareAmsDecoder:
-    """Decoder of AMS packets without a prefix, as they are inside TLS (Secure ADS).
-
-    It holds as much as :class:`AmsStreamDecoder`.
-
-    Args:
-        limit: Bytes of the longest packet that is taken.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._buffer = bytearray()
-        self._skip = 0
-
-    @property
-    def has_begun(self) -> bool:
-        """True if a packet has begun and is not complete."""
-        return bool(self._buffer) or self._skip > 0
+class BareAmsDecoder(StreamDecoder):
+    """Decoder of AMS packets without a prefix, as they are inside TLS (Secure ADS)."""
 
     def receive_one(self, data: bytes) -> bytes | None:
         """Return the packet if *data* is exactly one, as usual; else append *data*."""
@@ -164,9 +152,7 @@ class BareAmsDecoder:
             and int.from_bytes(data[_BODY_LENGTH], "little") == len(data) - AmsHeader.SIZE
         ):
             return data
-        skipped = min(self._skip, len(data))
-        self._skip -= skipped
-        self._buffer += memoryview(data)[skipped:]
+        self.receive(data)
         return None
 
     def next_item(self) -> StreamItem | None:

@@ -16,7 +16,7 @@ from eap.engine.rebuild import EngineStation
 from eap.net.framering_file import FrameRingFile
 from eap.pd.address import source_word, to_word
 from eap.pd.framering import MAX_FRAME, FrameRingWriter, SentFrame
-from eap.pd.link import FrameChannel, FrameHandler, FrameOrigin, OutFrame
+from eap.pd.link import ChannelLayer, FrameChannel, FrameHandler, FrameOrigin, OutFrame
 
 _source_of = lru_cache(1024)(source_word)  # the same ones send again and again
 _KNOWN = 1024
@@ -45,18 +45,14 @@ class FrameTap:
         return _RecordingChannel(channel, self._ring, self._number)
 
 
-class _RecordingChannel:
+class _RecordingChannel(ChannelLayer):
     """A channel whose sent frames are recorded."""
 
     def __init__(self, channel: FrameChannel, ring: FrameRingWriter, number: int) -> None:
-        self._channel = channel
+        super().__init__(channel)
         self._ring = ring
         self._number = number
         self._known: dict[OutFrame, SentFrame] = {}
-        self.drain = channel.drain
-        self.exchange_handler = channel.exchange_handler
-        self.link_header = channel.link_header
-        self.minimum_size = channel.minimum_size
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Send *frames* and record those that were sent; return the others."""

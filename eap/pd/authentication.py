@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from eap.codec.pd import PD_FRAME_START, PdHeader
-from eap.pd.link import FrameChannel, FrameHandler, OutFrame
+from eap.pd.link import ChannelLayer, FrameChannel, OutFrame
 from eap.pd.words import PdDropReason
 
 SIGNATURE_ID = 0xFFFE
@@ -149,32 +149,15 @@ class SignatureCheck:
         return None
 
 
-class SigningChannel:
+class SigningChannel(ChannelLayer):
     """A channel that signs the frames that end with a signature.
 
     Behind whatever else writes into frames: a change after it would be a wrong tag.
     """
 
     def __init__(self, channel: FrameChannel, keys: KeyRing) -> None:
-        self._channel = channel
+        super().__init__(channel)
         self._keys = keys
-
-    @property
-    def minimum_size(self) -> int:
-        """As that of the channel."""
-        return self._channel.minimum_size
-
-    def link_header(self, destination: str) -> bytes:
-        """Return the headroom of the channel."""
-        return self._channel.link_header(destination)
-
-    def drain(self, now_ns: int) -> int:
-        """Drain the channel."""
-        return self._channel.drain(now_ns)
-
-    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
-        """Exchange a handler of the channel."""
-        self._channel.exchange_handler(old, new)
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Sign *frames* and send them; return those that could not be sent."""

@@ -88,6 +88,18 @@ class FrameChannel(Protocol):
         """Shortest buffer to hand over; shorter frames are padded with zeros."""
 
 
+class ChannelLayer:
+    """Base of what is put before a channel to change or observe the frames that it sends."""
+
+    def __init__(self, channel: FrameChannel) -> None:
+        self._channel = channel
+        # As attributes, so that a frame pays for no further call.
+        self.drain = channel.drain
+        self.exchange_handler = channel.exchange_handler
+        self.link_header = channel.link_header
+        self.minimum_size = channel.minimum_size
+
+
 class PortTap(Protocol):
     """Observer of the frames of one port; a port without one pays nothing for it."""
 
@@ -133,7 +145,7 @@ TOGGLE_BIT = 0x20
 """Flips with each frame; bits 0 to 3 are the state, bit 4 is an error, which stops nothing here."""
 
 
-class StateChannel:
+class StateChannel(ChannelLayer):
     """A channel that writes the EAP SM octet, the state of its device, into all that it sends.
 
     Off unless a port has ``eap_sm``: older receivers take the byte for a reserved one that is 0.
@@ -146,26 +158,9 @@ class StateChannel:
     """
 
     def __init__(self, channel: FrameChannel, words: memoryview) -> None:
-        self._channel = channel
+        super().__init__(channel)
         self._words = words
         self._toggle = 0
-
-    @property
-    def minimum_size(self) -> int:
-        """As that of the channel."""
-        return self._channel.minimum_size
-
-    def link_header(self, destination: str) -> bytes:
-        """Return the headroom of the channel."""
-        return self._channel.link_header(destination)
-
-    def drain(self, now_ns: int) -> int:
-        """Drain the channel."""
-        return self._channel.drain(now_ns)
-
-    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
-        """Exchange a handler of the channel."""
-        self._channel.exchange_handler(old, new)
 
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Send *frames* with state and toggle; return those that could not be sent."""

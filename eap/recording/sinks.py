@@ -6,6 +6,7 @@ import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Generic, TypeVar
 
 from eap.codec.ethercat import EAP_PORT, FrameType
 from eap.config.record_texts import matcher
@@ -28,6 +29,8 @@ _PUBLISHER = slice(2, 8)
 """Of a frame of process data: the NetID of its sender."""
 _PROCESSED = 0x02
 _WRAPPINGS = 4096
+
+WriterT = TypeVar("WriterT", bound=ValuesWriter | FramesWriter)
 
 
 def header_of(
@@ -69,7 +72,36 @@ def placed_variables(layout: ImageLayout, patterns: Sequence[str]) -> list[Place
     ]
 
 
-class ValuesSink:
+class RecordedFile(Generic[WriterT]):
+    """A file that is recorded, with the writer of its format."""
+
+    def __init__(self, writer: WriterT) -> None:
+        self._writer = writer
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far."""
+        return self._writer.size
+
+    def add_gap(self, gap: Gap) -> None:
+        """Add what is missing."""
+        self._writer.add_event(event_of(gap))
+
+    def add_event(self, event: RecordingEvent) -> None:
+        """Add an event."""
+        self._writer.add_event(event)
+
+    def flush(self) -> None:
+        """Give all to the system, and have the disk keep it."""
+        self._writer.flush()
+        self._writer.sync()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        self._writer.abandon()
+
+
+class ValuesSink(RecordedFile[ValuesWriter]):
     """An MCAP file.
 
     Args:
@@ -86,17 +118,12 @@ class ValuesSink:
         layouts: Sequence[ImageLayout],
         patterns: Sequence[str],
     ) -> None:
-        self._writer = ValuesWriter(path, header)
+        super().__init__(ValuesWriter(path, header))
         self._stations = {
             layout.station: self._writer.add_station(layout.station, variables)
             for layout in layouts
             if (variables := placed_variables(layout, patterns))
         }
-
-    @property
-    def size(self) -> int:
-        """Bytes of the file so far."""
-        return self._writer.size
 
     @property
     def messages(self) -> int:
@@ -112,30 +139,13 @@ class ValuesSink:
         for cycle, time_ns, sample in samples_in(block):
             write(station, cycle, time_ns, sample)
 
-    def add_gap(self, gap: Gap) -> None:
-        """Add what is missing."""
-        self._writer.add_event(event_of(gap))
-
-    def add_event(self, event: RecordingEvent) -> None:
-        """Add an event."""
-        self._writer.add_event(event)
-
-    def flush(self) -> None:
-        """Give all to the system, and have the disk keep it."""
-        self._writer.flush()
-        self._writer.sync()
-
     def close(self, time_ns: int) -> None:
         """End the file."""
         del time_ns  # its index has times already
         self._writer.close()
 
-    def abandon(self) -> None:
-        """Close the file as it is."""
-        self._writer.abandon()
 
-
-class FramesSink:
+class FramesSink(RecordedFile[FramesWriter]):
     """A pcapng file.
 
     Args:
@@ -154,7 +164,7 @@ class FramesSink:
         patterns: Sequence[str],
         ports: Callable[[], Sequence[str]],
     ) -> None:
-        self._writer = FramesWriter(path, header)
+        super().__init__(FramesWriter(path, header))
         self._is_selected = matcher(patterns)
         self._addressing = {
             f"{layout.station}/{port.name}": PortAddressing(
@@ -168,11 +178,6 @@ class FramesSink:
         self._wanted: list[bool] = []
         self._interfaces: dict[int, int] = {}
         self._wrappings: dict[tuple[int, bool, int, bytes], Wrapping] = {}
-
-    @property
-    def size(self) -> int:
-        """Bytes of the file so far."""
-        return self._writer.size
 
     @property
     def messages(self) -> int:
@@ -193,26 +198,9 @@ class FramesSink:
             wrapping = self._wrapping(record)
             write(interface, time_ns, wrapping.wrap(record.frame), outbound=record.is_sent)
 
-    def add_gap(self, gap: Gap) -> None:
-        """Add what is missing."""
-        self._writer.add_event(event_of(gap))
-
-    def add_event(self, event: RecordingEvent) -> None:
-        """Add an event."""
-        self._writer.add_event(event)
-
-    def flush(self) -> None:
-        """Give all to the system, and have the disk keep it."""
-        self._writer.flush()
-        self._writer.sync()
-
     def close(self, time_ns: int) -> None:
         """End the file."""
         self._writer.close(time_ns)
-
-    def abandon(self) -> None:
-        """Close the file as it is."""
-        self._writer.abandon()
 
     def _open_interface(self, port: int) -> int:
         name = self._ports[port]

@@ -16,7 +16,7 @@ from ipaddress import IPv4Address
 from secrets import randbelow
 from threading import Thread
 from time import monotonic_ns
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple, TypedDict, TypeVar
 
 from eap.ams.spec import SecureRouteSpec, TransportKind
 from eap.ams.transport_table import Transport
@@ -28,11 +28,18 @@ from eap.net.reconnecting import ReconnectingLink, ReconnectPolicy, connect_tcp
 from eap.net.tcp import set_stream_options
 from eap.runtime.drop_counters import DropReason
 from eap.services.routing.station_router import StationRouter
-from eap.services.transports.accepting import Listeners, ListeningSocket, connection_name
+from eap.services.transports.accepting import (
+    ConnectionServer,
+    Listeners,
+    ListeningSocket,
+    connection_name,
+)
 from eap.services.transports.ams_connection import AmsConnection, ClientAddresses
 from eap.services.transports.demultiplexer import Demultiplexer
 
 LIMITS = ListenerLimits()
+
+AmsConnectionT = TypeVar("AmsConnectionT", bound=AmsConnection)
 
 logger = logging.getLogger(__name__)
 
@@ -65,7 +72,54 @@ class AmsClients:
         return "the connection was closed" if found is None else found.send(packets)
 
 
-class AmsTransport:
+class AmsListener(ConnectionServer[AmsConnectionT]):
+    """One listening socket for AMS, by TCP or by Secure ADS.
+
+    Args:
+        listener: The socket; closed by :meth:`close`.
+        name: Shown in ``status`` and the log.
+        full: Counter of connections that are not admitted.
+        count_dropped: Counts dropped packets and connections.
+        listeners: All listeners of the process.
+    """
+
+    def __init__(
+        self,
+        listener: socket.socket,
+        name: str,
+        full: DropReason,
+        count_dropped: Callable[[DropReason], object],
+        listeners: Listeners,
+    ) -> None:
+        self.name = name
+        self._count = count_dropped
+        self._full = full
+        self._listening = ListeningSocket(listener, name, self, listeners, LIMITS)
+
+    async def serve(self) -> None:
+        """Accept until cancelled; then close all connections."""
+        await self._listening.serve()
+
+    def close(self) -> None:
+        """Close the listener, which is not served any more."""
+        self._listening.close()
+
+    def refuse_connection(self, sock: socket.socket, why: str) -> None:
+        """Count a connection that is not admitted (ConnectionServer)."""
+        del sock, why
+        self.count_dropped(self._full)
+
+    def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
+        """Count an answer: no requests are sent on accepted connections (PacketHandler)."""
+        del packet, connection
+        self.count_dropped(DropReason.AMS_UNASKED)
+
+    def count_dropped(self, reason: DropReason) -> None:
+        """Count a dropped packet or connection (PacketHandler)."""
+        self._count(reason)
+
+
+class AmsTransport(AmsListener[AmsConnection]):
     """One listening socket and the stations behind it.
 
     The kernel detects a peer that vanished without FIN within a minute (TCP keep-alive).
@@ -86,19 +140,10 @@ class AmsTransport:
         count_dropped: Callable[[DropReason], None],
         listeners: Listeners,
     ) -> None:
-        self.count_dropped = count_dropped
         self._demultiplexer = demultiplexer
         self._clients = clients
         name = "ams-tcp {}:{}".format(*listener.getsockname())
-        self._listening = ListeningSocket(listener, name, self, listeners, LIMITS)
-
-    async def serve(self) -> None:
-        """Accept until cancelled; then close all connections."""
-        await self._listening.serve()
-
-    def close(self) -> None:
-        """Close the listener, which is not served any more."""
-        self._listening.close()
+        super().__init__(listener, name, DropReason.AMS_FULL, count_dropped, listeners)
 
     def connection_from(self, sock: socket.socket, host: str) -> AmsConnection:
         """Return the connection on an accepted socket (ConnectionServer)."""
@@ -120,11 +165,6 @@ class AmsTransport:
         finally:
             connection.close(CloseReason.ENDED)
 
-    def refuse_connection(self, sock: socket.socket, why: str) -> None:
-        """Count a connection that is not admitted (ConnectionServer)."""
-        del sock, why
-        self.count_dropped(DropReason.AMS_FULL)
-
     def connection_opened(self, connection: AmsConnection) -> None:
         """Add the connection (PacketHandler)."""
         self._clients.add(connection)
@@ -138,11 +178,6 @@ class AmsTransport:
     def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
         """Forward a request to the stations (PacketHandler)."""
         self._demultiplexer.receive(packet, connection.name)
-
-    def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
-        """Count an answer: no requests are sent on accepted connections (PacketHandler)."""
-        del packet, connection
-        self.count_dropped(DropReason.AMS_UNASKED)
 
     def _assign_address(self, host: str) -> tuple[NetId, int]:
         return self._clients.addresses.next(host, self._demultiplexer.has)

@@ -36,7 +36,6 @@ from eap.net.ipsocket import open_tcp_listener
 from eap.net.limits import (
     OWN_HOST,
     CloseReason,
-    ListenerLimits,
     Rate,
     SourceRateLimiter,
     SourceRates,
@@ -50,13 +49,12 @@ from eap.services.routing.station_routes import StationRoutes
 from eap.services.tasks import keep_serving
 from eap.services.transports.accepting import (
     Listeners,
-    ListeningSocket,
     connection_name,
     wait_readable,
 )
 from eap.services.transports.ams_connection import AmsConnection
 from eap.services.transports.ams_discovery import RouteAdmin
-from eap.services.transports.ams_tcp import AmsClients
+from eap.services.transports.ams_tcp import AmsClients, AmsListener
 from eap.services.transports.route_logins import RouteLogins
 from eap.services.transports.secure_ads import (
     HANDSHAKE_S,
@@ -65,7 +63,6 @@ from eap.services.transports.secure_ads import (
     MessageReader,
 )
 
-LIMITS = ListenerLimits()
 RATES = SourceRates(
     source=Rate(32, 4.0),
     known=Rate(128, 16.0),
@@ -111,7 +108,7 @@ class ServerSettings(NamedTuple):
     route_admin: RouteAdmin
 
 
-class AmsTlsListener:
+class AmsTlsListener(AmsListener[AmsTlsConnection]):
     """One listening socket of a station.
 
     Args:
@@ -132,20 +129,11 @@ class AmsTlsListener:
     ) -> None:
         self._router = router
         self._settings = settings
-        self._count = count_dropped
         self._clients = AmsClients()
         self._of_transport: dict[str, set[str]] = {}
         self._limiter = SourceRateLimiter(RATES, MAX_SOURCES, monotonic())
-        self.name = f"{TransportKind.AMS_TLS} {{}}:{{}}".format(*listener.getsockname())
-        self._listening = ListeningSocket(listener, self.name, self, listeners, LIMITS)
-
-    async def serve(self) -> None:
-        """Accept until cancelled; then close all connections."""
-        await self._listening.serve()
-
-    def close(self) -> None:
-        """Close the listener, which is not served any more."""
-        self._listening.close()
+        name = f"{TransportKind.AMS_TLS} {{}}:{{}}".format(*listener.getsockname())
+        super().__init__(listener, name, DropReason.TLS_FULL, count_dropped, listeners)
 
     def connection_from(self, sock: socket.socket, host: str) -> AmsTlsConnection:
         """Return the connection on an accepted socket (ConnectionServer)."""
@@ -154,7 +142,7 @@ class AmsTlsListener:
         limiter = self._limiter
         is_local = host == OWN_HOST
         if not (limiter.take_local(now_s) if is_local else limiter.take(address, now_s)):
-            self._count(DropReason.TLS_FULL)
+            self.count_dropped(DropReason.TLS_FULL)
             raise ConnectionRefusedError(f"{address} connects too often")
         return AmsTlsConnection(connection_name(sock), address, self, host=host)
 
@@ -173,11 +161,6 @@ class AmsTlsListener:
             await connection.closed
         finally:
             connection.close(CloseReason.ENDED)
-
-    def refuse_connection(self, sock: socket.socket, why: str) -> None:
-        """Count a connection that is not admitted (ConnectionServer)."""
-        del sock, why
-        self._count(DropReason.TLS_FULL)
 
     def connection_opened(self, connection: AmsConnection) -> None:
         """Add the connection (PacketHandler)."""
@@ -202,15 +185,6 @@ class AmsTlsListener:
     def handle_packet(self, packet: bytes, connection: AmsConnection) -> None:
         """Forward a request to the station (PacketHandler)."""
         self._router.receive(packet, _transport_of(connection), connection.name)
-
-    def handle_answer(self, packet: bytes, connection: AmsConnection) -> None:
-        """Count an answer: no requests are sent on accepted connections (PacketHandler)."""
-        del packet, connection
-        self._count(DropReason.AMS_UNASKED)
-
-    def count_dropped(self, reason: DropReason) -> None:
-        """Count a dropped packet or connection (PacketHandler)."""
-        self._count(reason)
 
     async def _shake_hands(self, connection: AmsTlsConnection, sock: socket.socket) -> bool:
         """Complete TLS and exchange the messages; return whether packets may follow."""
@@ -303,7 +277,7 @@ class AmsTlsListener:
         return ConnectInfo(self._router.net_id, flags, socket.gethostname(), error).encode()
 
     def _refuse(self, connection: AmsTlsConnection, reason: DropReason, text: str) -> None:
-        self._count(reason)
+        self.count_dropped(reason)
         cause = caused_by((self.name, reason, connection.address), connection.address)
         logger.warning(
             "%s: %s refused (%s): %s", self.name, connection.address, reason, text, extra=cause

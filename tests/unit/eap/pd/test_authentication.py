@@ -34,6 +34,7 @@ class Line:
     """A channel that keeps what is sent."""
 
     minimum_size = 0
+    drain = exchange_handler = link_header = None
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []

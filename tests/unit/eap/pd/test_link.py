@@ -38,6 +38,9 @@ class Wire:
     def link_header(self, destination: str) -> bytes:
         return destination.encode()[:4]
 
+    def exchange_handler(self, old, new) -> None:
+        self.exchanged = old, new
+
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         self.sent += [bytes(frame.view[frame.headroom :]) for frame in frames]
         return frames[1:]

@@ -29,7 +29,7 @@ from eap.net.tls import HAS_PSK
 from eap.runtime.drop_counters import DropReason
 from eap.runtime.store import StationStore
 from eap.services.routing.station_routes import StationRoutes
-from eap.services.transports import secure_listener
+from eap.services.transports import ams_tcp, secure_listener
 from eap.services.transports.accepting import Listeners
 from eap.services.transports.ams_discovery import RouteAdmin
 from eap.services.transports.route_logins import RouteLogins
@@ -335,7 +335,7 @@ def test_half_open_connections_do_not_shut_others_out(
 ) -> None:
     ample = Rate(1000, 1000.0)
     monkeypatch.setattr(secure_listener, "RATES", SourceRates(ample, ample, ample, ample))
-    monkeypatch.setattr(secure_listener, "LIMITS", ListenerLimits(16, 4, 8))
+    monkeypatch.setattr(ams_tcp, "LIMITS", ListenerLimits(16, 4, 8))
 
     async def script(server: Server) -> None:
         flood = [await asyncio.open_connection(*server.address) for _ in range(50)]
