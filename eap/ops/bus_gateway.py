@@ -7,7 +7,7 @@ the sizes of mailboxes that files need, and for hints about refused requests.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import NoReturn, TypeVar
 
@@ -30,9 +30,8 @@ from eap.gateway.error_table import Cause
 from eap.gateway.requests import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT, address_text
 from eap.gateway.slaves import NO_DICTIONARY, MasterSlave
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.ops.bus_session import Begin, Slave, choose, no_mailbox
+from eap.ops.bus_session import Begin, Slave, SlaveBus, choose, no_mailbox
 from eap.runtime.bus_status import FrameCounts
-from eap.runtime.engine_messages import LockState, SlaveReport
 
 T = TypeVar("T")
 
@@ -46,8 +45,8 @@ _NO_ANSWER_HINT = (
 )
 
 
-class GatewayBus:
-    """A bus behind a gateway; fits :class:`eap.ops.bus_session.SlaveBus`.
+class GatewayBus(SlaveBus):
+    """A bus behind a gateway, which reports no times, counters or configuration.
 
     Slave 0 is the master itself, with its dictionary.
 
@@ -146,33 +145,6 @@ class GatewayBus:
         """Refuse: a gateway passes mailbox messages, and no datagrams."""
         procedure.close()
         _refuse(name)
-
-    def known(self) -> Sequence[Slave]:
-        """Return the slaves that the gateway describes."""
-        return self.scan()
-
-    def history(self) -> None:
-        """Return None: a gateway reports no times."""
-        return
-
-    def forget(self) -> None:
-        """Do nothing: a gateway has no such service."""
-
-    def lock_state(self) -> LockState | None:
-        """Return None: the cycle of no station follows clocks by way of it."""
-        return None
-
-    def reports(self) -> Mapping[int, SlaveReport]:
-        """Return nothing: a gateway reports no history."""
-        return {}
-
-    def mismatch(self) -> None:
-        """Return None: a gateway says nothing about the configuration of its bus."""
-        return
-
-    def eoe_report(self) -> None:
-        """Return None: a gateway reports no Ethernet frames."""
-        return
 
     def frame_counts(self) -> FrameCounts:
         """Refuse likewise."""

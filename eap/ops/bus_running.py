@@ -26,7 +26,7 @@ from devicebus.wire.register import AlStatus, DlStatus, Register
 from eap.control import bus as words
 from eap.control.protocol import AnswerT, Method, ParametersT
 from eap.errors import ControlError
-from eap.ops.bus_session import Begin, BusMismatch, Slave, choose
+from eap.ops.bus_session import Begin, BusMismatch, Slave, SlaveBus
 from eap.ops.client import ControlClient, connect_station
 from eap.runtime.bus_status import (
     FrameCounts,
@@ -48,8 +48,8 @@ _S = 1_000_000_000
 _PER_STEP = 60
 
 
-class RunningBus:
-    """One bus port of a running station; fits :class:`eap.ops.bus_session.SlaveBus`.
+class RunningBus(SlaveBus):
+    """One bus port of a running station.
 
     Args:
         client: Connected to the appliance, for this bus alone.
@@ -104,13 +104,6 @@ class RunningBus:
         """Clear past faults of the running master."""
         self._call(words.BUS_FORGET, words.BUS_WAIT_UP_S)
 
-    def find(self, name: str) -> Slave:
-        """Return the slave with a station address or a name; raise BusError if that is not one."""
-        return choose(self.scan(), name)
-
-    def require_mailbox(self, slave: Slave) -> None:
-        """Do nothing: this master knows the mailboxes of its slaves."""
-
     def converse(
         self,
         slave: Slave,
@@ -118,13 +111,7 @@ class RunningBus:
         name: str,
         meanwhile: Callable[[], None] | None = None,
     ) -> T:
-        """Run a conversation with a slave's mailbox and return its result.
-
-        Raises:
-            BusError: the slave has no mailbox, or does not answer.
-            SdoAbortError, SoeError, FoeError: it refuses.
-            ControlError: the appliance ended, or other clients occupy the mailbox.
-        """
+        """Run a conversation with a slave's mailbox and return its result."""
         del name  # the master has its own
         report = self._reports[slave.station]
         if not report.to_slave:
@@ -133,12 +120,7 @@ class RunningBus:
         return self._drive(slave, conversation, meanwhile)
 
     def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
-        """Bring slaves to a state, which the master then keeps.
-
-        Raises:
-            AlStatusError, StateTimeoutError: a slave refuses, or exceeds its time limit.
-            BusError: several do.
-        """
+        """Bring slaves to a state, which the master then keeps."""
         # Station 0 is all slaves: the master then brings them to the state together.
         is_all = {slave.station for slave in slaves} == set(self._reports)
         for station in [0] if is_all else [slave.station for slave in slaves]:

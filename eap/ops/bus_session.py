@@ -4,18 +4,19 @@
         for unit in bus.scan(): ...
         bus.converse(unit, lambda sizes: coe_client.upload(0x1018, 1))
 
-Two kinds fit :class:`SlaveBus`: ``BusSession`` is a master of its own, ``RunningBus`` in
-bus_running.py uses that of a running station.  Slaves keep their states.  Only a slave in INIT,
-which has no mailbox, is brought to PREOP for a conversation.
+A :class:`SlaveBus` is a ``BusSession``, a master of its own, a ``RunningBus`` (bus_running.py),
+which uses that of a running station, or a ``GatewayBus`` (bus_gateway.py).  Slaves keep their
+states.  Only a slave in INIT, which has no mailbox, is brought to PREOP for a conversation.
 """
 
 from __future__ import annotations
 
 import select
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 
@@ -47,7 +48,89 @@ REPORT_NS = 100_000_000
 """Interval of calls of *meanwhile*."""
 
 
-class BusSession:
+class SlaveBus(ABC):
+    """A bus with a master."""
+
+    @abstractmethod
+    def scan(self) -> Sequence[Slave]:
+        """Return all slaves in the order of the line."""
+
+    def find(self, name: str) -> Slave:
+        """Return the slave with a station address or a name; raise BusError if that is not one."""
+        return choose(self.scan(), name)
+
+    def known(self) -> Sequence[Slave]:
+        """Return all slaves in the order of the line, without a new scan if they are known."""
+        return self.scan()
+
+    def require_mailbox(self, slave: Slave) -> None:
+        """Read the mailbox size of *slave*, which files need; raise BusError without one.
+
+        A master knows the mailboxes of its slaves already.
+        """
+        del slave
+
+    @abstractmethod
+    def converse(
+        self,
+        slave: Slave,
+        begin: Begin[T],
+        name: str,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> T:
+        """Run a conversation with a slave's mailbox and return its result.
+
+        Raises:
+            BusError: the slave has no mailbox, or does not answer.
+            SdoAbortError, SoeError, FoeError: it refuses.
+            ControlError: the appliance ended, or other clients occupy the mailbox.
+        """
+
+    @abstractmethod
+    def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
+        """Bring slaves to a state together.
+
+        Raises:
+            AlStatusError, StateTimeoutError: a slave refuses, or exceeds its time limit.
+            BusError: several do; the message has a line for each.
+        """
+
+    @abstractmethod
+    def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
+        """Run a procedure to its end and return its result, or raise its error."""
+
+    @abstractmethod
+    def frame_counts(self) -> FrameCounts:
+        """Return the counters of the master's frames."""
+
+    # Only the master of a running station has a record of its bus.
+
+    def lock_state(self) -> LockState | None:
+        """Return the lock of the cycle to the clocks of the bus; None if it runs free."""
+        return None
+
+    def reports(self) -> Mapping[int, SlaveReport]:
+        """Return the reports of a running master by station address; else nothing."""
+        return {}
+
+    def eoe_report(self) -> EoeReport | None:
+        """Return the state of the Ethernet switch; None without one."""
+        return None
+
+    def mismatch(self) -> BusMismatch | None:
+        """Return found and expected slaves of a bus that is not as configured, else None."""
+        return None
+
+    def history(self) -> History | None:
+        """Return the times of faults; None without a record."""
+        return None
+
+    def forget(self) -> None:
+        """Clear past faults."""
+        return
+
+
+class BusSession(SlaveBus):
     """One master on one bus.
 
     Args:
@@ -81,9 +164,6 @@ class BusSession:
             BusError: there is none, or several have that name.
         """
         return choose(self._slaves or self.scan(), name)
-
-    def require_mailbox(self, slave: Slave) -> None:
-        """Do nothing: this master knows the mailboxes of its slaves."""
 
     def converse(
         self,
@@ -140,32 +220,9 @@ class BusSession:
         """Return the counters of the frames of this session."""
         return count_frames(self._bus.link.stats())
 
-    def lock_state(self) -> LockState | None:
-        """Return None: the cycle of no station follows clocks by way of it."""
-        return None
-
-    def reports(self) -> Mapping[int, SlaveReport]:
-        """Return nothing: this master keeps no history."""
-        return {}
-
-    def eoe_report(self) -> None:
-        """Return None: this master carries no Ethernet frames."""
-        return
-
-    def mismatch(self) -> None:
-        """Return None: this master expects no slaves."""
-        return
-
     def known(self) -> Sequence[Slave]:
         """Return the slaves of the last scan, or scan."""
         return self._slaves or self.scan()
-
-    def history(self) -> None:
-        """Return None: this master has no record of the time before."""
-        return
-
-    def forget(self) -> None:
-        """Do nothing: this master keeps no record."""
 
     def _bring_all(self, bus_slaves: Sequence[BusSlave], target: AlState) -> None:
         self._run_all(bus_slaves, [bring(self._bus, bus_slave, target) for bus_slave in bus_slaves])
@@ -310,58 +367,6 @@ class BusMismatch(NamedTuple):
     """The differences, a line for each."""
     found: Sequence[Slave]
     expected: Sequence[Slave]
-
-
-class SlaveBus(Protocol):
-    """A bus with a master."""
-
-    def scan(self) -> Sequence[Slave]:
-        """Return all slaves in the order of the line."""
-
-    def find(self, name: str) -> Slave:
-        """Return the slave with a station address or a name; raise BusError if that is not one."""
-
-    def require_mailbox(self, slave: Slave) -> None:
-        """Read the mailbox size of *slave*, which files need; raise BusError without one."""
-
-    def converse(
-        self,
-        slave: Slave,
-        begin: Begin[T],
-        name: str,
-        meanwhile: Callable[[], None] | None = None,
-    ) -> T:
-        """Run a conversation with a slave's mailbox; return its result or raise."""
-
-    def bring(self, slaves: Sequence[Slave], target: AlState) -> None:
-        """Bring slaves to a state, or raise."""
-
-    def run(self, procedure: Procedure[T], name: str = "a procedure") -> T:
-        """Run a procedure to its end and return its result, or raise its error."""
-
-    def frame_counts(self) -> FrameCounts:
-        """Return the counters of the master's frames."""
-
-    def lock_state(self) -> LockState | None:
-        """Return the lock of the cycle to the clocks of the bus; None if it runs free."""
-
-    def reports(self) -> Mapping[int, SlaveReport]:
-        """Return the reports of a running master by station address; else nothing."""
-
-    def eoe_report(self) -> EoeReport | None:
-        """Return the state of the Ethernet switch; None without one."""
-
-    def mismatch(self) -> BusMismatch | None:
-        """Return found and expected slaves of a bus that is not as configured, else None."""
-
-    def known(self) -> Sequence[Slave]:
-        """Return all slaves in the order of the line, without a new scan if they are known."""
-
-    def history(self) -> History | None:
-        """Return the times of faults; None without a record."""
-
-    def forget(self) -> None:
-        """Clear past faults."""
 
 
 def choose(slaves: Sequence[Slave], name: str) -> Slave:

@@ -6,6 +6,7 @@ Each request connects anew, because appliances start and end while the view is o
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from time import monotonic
 from typing import Any, ClassVar
 
@@ -14,10 +15,10 @@ from textual import on, work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
-from textual.screen import ModalScreen, Screen
 from textual.widgets import Button, Checkbox, DataTable, Footer, Input, Label, Static
 
 from eap.cli import routes_view
+from eap.cli.dialogs import FilteredScreen, Form, Message, Question
 from eap.cli.routes_tui.table import (
     STYLES,
     Line,
@@ -45,7 +46,7 @@ _SCROLLBAR = 1
 """Columns that one takes when there are more rows than lines."""
 
 
-class RoutesScreen(Screen[None]):
+class RoutesScreen(FilteredScreen):
     """Routes and connections of running stations.
 
     Args:
@@ -200,27 +201,11 @@ class RoutesScreen(Screen[None]):
         self._station = names[(at + 1) % len(names)]
         self._show()
 
-    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool:
-        """Return whether a key has its action: a slash in a field is a sign."""
-        del parameters
-        return action != "filter" or not isinstance(self.focused, Input)
-
-    def action_filter(self) -> None:
-        """Edit the filter of rows."""
-        field = self.query_one("#filter", Input)
-        field.display = True
-        self.set_focus(field)
-
     @on(Input.Changed, "#filter")
     def _apply_filter(self, event: Input.Changed) -> None:
         self._match = event.value.strip()
         self._show()
         self.fetch()
-
-    @on(Input.Submitted, "#filter")
-    def _leave_filter(self) -> None:
-        self.query_one("#filter").display = False
-        self._grid.focus()
 
     def key_escape(self) -> None:
         """End the filter."""
@@ -373,7 +358,7 @@ class Tick(Checkbox):
         super().watch_value()
 
 
-class RouteForm(ModalScreen[list[str]]):
+class RouteForm(Form[list[str]]):
     """The fields of a route; it stays until the route is taken, or the form is left.
 
     Its result is the warnings about the route, or None if it was cancelled.
@@ -419,11 +404,6 @@ class RouteForm(ModalScreen[list[str]]):
                 yield Button("Save (^s)", id="save", compact=True)
                 yield Button("Cancel (esc)", id="leave", compact=True)
 
-    @on(Button.Pressed, "#leave")
-    def action_leave(self) -> None:
-        """Close the form without a change."""
-        self.dismiss(None)
-
     @on(Input.Submitted)
     @on(Button.Pressed, "#save")
     def action_save(self) -> None:
@@ -433,88 +413,13 @@ class RouteForm(ModalScreen[list[str]]):
             numbers = {name: int(texts[name] or 0) for name in ("timeout_ms",)}
             numbers["octets"] = int(texts["octets"] or 4)
         except ValueError as exc:
-            self._show_problem(f"expected a number: {exc}")
+            self.show_problem(f"expected a number: {exc}")
             return
-        self._show_problem("sending…")
-        self._send(
-            texts
-            | numbers
-            | {"replaces": self._values.get("replaces", "")}
-            | {
-                name: self.query_one(f"#{name}", Tick).value
-                for name in ("probed", "unidirectional")
-            }
-        )
-
-    @work(thread=True, exclusive=True)
-    def _send(self, params: dict[str, Any]) -> None:
-        try:
-            warnings = self._save(params)
-        except EapError as exc:
-            self.app.call_from_thread(self._show_problem, str(exc))
-        else:
-            self.app.call_from_thread(self.dismiss, warnings)
-
-    def _show_problem(self, text: str) -> None:
-        self.query_one("#problem", Static).update(text)
-
-
-class Question(ModalScreen[bool]):
-    """Yes or no; Enter alone is no."""
-
-    # Enter, pressed once too often, must not remove a route.
-    AUTO_FOCUS = "#no"
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("y", "answer(True)", "Yes"),
-        Binding("n,escape", "answer(False)", "No"),
-    ]
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self._text = text
-
-    def compose(self) -> ComposeResult:
-        """Yield the question and two buttons."""
-        with Vertical(classes="box"):
-            yield Static(self._text, markup=False)
-            with Horizontal(classes="buttons"):
-                yield Button("Yes (y)", id="yes", compact=True)
-                yield Button("No (n)", id="no", compact=True)
-
-    @on(Button.Pressed)
-    def answer_by_button(self, event: Button.Pressed) -> None:
-        """Answer by a button."""
-        self.dismiss(event.button.id == "yes")
-
-    def action_answer(self, is_yes: bool) -> None:
-        """Answer by a key."""
-        self.dismiss(is_yes)
-
-
-class Message(ModalScreen[None]):
-    """A text with a button to close it."""
-
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape,enter,space,q", "app.pop_screen", "Close"),
-    ]
-
-    def __init__(self, title: str, text: str) -> None:
-        super().__init__()
-        self._title = title
-        self._text = text
-
-    def compose(self) -> ComposeResult:
-        """Yield the text."""
-        with Vertical(classes="box"):
-            yield Static(self._title, classes="title", markup=False)
-            yield Static(self._text, markup=False)
-            with Horizontal(classes="buttons"):
-                yield Button("Close (esc)", compact=True)
-
-    @on(Button.Pressed)
-    def close_by_button(self) -> None:
-        """Go back."""
-        self.dismiss()
+        replaced = {"replaces": self._values.get("replaces", "")}
+        ticks = {
+            name: self.query_one(f"#{name}", Tick).value for name in ("probed", "unidirectional")
+        }
+        self.perform("sending…", partial(self._save, texts | numbers | replaced | ticks))
 
 
 def values_of(row: RouteRow) -> dict[str, Any]:

@@ -9,7 +9,8 @@ from textual import work
 from textual.app import App
 from textual.binding import Binding, BindingType
 
-from eap.cli.routes_tui.app import Message, RoutesScreen
+from eap.cli.dialogs import Message
+from eap.cli.routes_tui.app import RoutesScreen
 from eap.cli.routes_tui.table import RouteRequests
 from eap.cli.top_model import Tab, TopModel
 from eap.cli.top_tui.overview import HELP, OverviewScreen

@@ -12,11 +12,10 @@ from textual import on, work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
-from textual.screen import Screen
 from textual.widgets import DataTable, Footer, Input, Static
 
+from eap.cli.dialogs import FilteredScreen, Message, Question
 from eap.cli.output import value_text
-from eap.cli.routes_tui.app import Message, Question
 from eap.cli.top_model import (
     COLUMNS,
     SEVERITY_STYLES,
@@ -78,7 +77,7 @@ Last minute: a bar for the rate, ! for lost or late PDs, · for none.
 Left out columns: a wider terminal shows them."""
 
 
-class OverviewScreen(Screen[None]):
+class OverviewScreen(FilteredScreen):
     """Tables of a model.
 
     Args:
@@ -296,27 +295,11 @@ class OverviewScreen(Screen[None]):
             self._set_match(f"station={line.row.name}")
             self.show_tab(Tab.PDS)
 
-    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool:
-        """Return whether a key has its action: a slash in a field is a sign."""
-        del parameters
-        return action != "filter" or not isinstance(self.focused, Input)
-
-    def action_filter(self) -> None:
-        """Edit the filter of rows."""
-        field = self.query_one("#filter", Input)
-        field.display = True
-        self.set_focus(field)
-
     @on(Input.Changed, "#filter")
     def _apply_filter(self, event: Input.Changed) -> None:
         if event.value.strip() != self._model.match:
             self._model.match = event.value.strip()
             self.show()
-
-    @on(Input.Submitted, "#filter")
-    def _leave_filter(self) -> None:
-        self.query_one("#filter").display = False
-        self._grid.focus()
 
     def key_escape(self) -> None:
         """End the filter, and go back from the PDs of a station."""

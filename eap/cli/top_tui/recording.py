@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
-import msgspec
-from textual import on, work
+from textual import on
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
-from textual.screen import ModalScreen
 from textual.widgets import Button, Input, Static
 
-from eap.errors import EapError, describe_os_error
+from eap.cli.dialogs import Form
 from eap.live.rows import BusRow, PdFlow, StationRow
 from eap.quantities import count
 from eap.runtime.recordings import RecordingState
@@ -78,7 +77,7 @@ def end_recording(name: str) -> str:
     return f"recording {state.name!r}: {things}, {lost}; {', '.join(state.files)}"
 
 
-class RecordForm(ModalScreen[str]):
+class RecordForm(Form[str]):
     """The path of a recording; its result is what is recorded, or None if it was cancelled.
 
     Args:
@@ -109,29 +108,9 @@ class RecordForm(ModalScreen[str]):
                 yield Button("Record (enter)", id="start", compact=True)
                 yield Button("Cancel (esc)", id="leave", compact=True)
 
-    @on(Button.Pressed, "#leave")
-    def action_leave(self) -> None:
-        """Close the form without a recording."""
-        self.dismiss(None)
-
     @on(Input.Submitted)
     @on(Button.Pressed, "#start")
     def begin(self) -> None:
         """Start the recording."""
-        self._show_problem("starting…")
-        self._begin(Path(self.query_one("#target", Input).value.strip()))
-
-    # A recorder reports after its imports; in Textual's own thread the keyboard would freeze.
-    @work(thread=True, exclusive=True)
-    def _begin(self, target: Path) -> None:
-        try:
-            text = self._start(self._thing, target)
-        except OSError as exc:
-            self.app.call_from_thread(self._show_problem, describe_os_error(exc))
-        except (EapError, msgspec.MsgspecError) as exc:
-            self.app.call_from_thread(self._show_problem, str(exc))
-        else:
-            self.app.call_from_thread(self.dismiss, text)
-
-    def _show_problem(self, text: str) -> None:
-        self.query_one("#problem", Static).update(text)
+        target = Path(self.query_one("#target", Input).value.strip())
+        self.perform("starting…", partial(self._start, self._thing, target))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from eap.cli.routes_tui.app import Message, Question, RouteForm, values_of
+from eap.cli.dialogs import Message, Question
+from eap.cli.routes_tui.app import RouteForm, values_of
 from eap.cli.routes_tui.table import RouterClient
 from eap.errors import ControlError
 from tests.support.fakeroutes import ISLAND, PRESS
