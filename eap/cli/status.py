@@ -423,6 +423,9 @@ def full_view(document: StatusReport, now_s: float) -> Iterator[RenderableType]:
             # Above the table: a heading with all stations would widen its first column.
             yield Styled(label, style="bold")
         yield _processes_table(appliance)
+        if groups := appliance.processes.get("engine", {}).get("groups"):
+            yield ""
+            yield _groups(groups)
         if listeners := appliance.listeners:
             yield ""
             yield _listeners(listeners)
@@ -479,6 +482,20 @@ def _processes_table(appliance: ApplianceStatus) -> TextTable:
 
 def _descriptors(descriptors: Row | None) -> str:
     return "" if descriptors is None else f"{descriptors['used']} of {descriptors['limit']}"
+
+
+def _groups(groups: Iterable[Row]) -> TextTable:
+    """Return the groups of stations that run one after the other in a wake-up of the engine."""
+    table = TextTable(
+        "Group of cycle",
+        Column("Begins at", is_number=True),
+        Column("Stations", is_number=True),
+        Column("Last station after", is_number=True),
+    )
+    for group in groups:
+        begin, last = duration(group["phase_us"]), duration(group["last_us"])
+        table.add_row(duration(group["cycle_us"]), begin, str(len(group["stations"])), last)
+    return table
 
 
 def _bridges(appliance: ApplianceStatus) -> TextTable:

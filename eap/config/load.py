@@ -60,6 +60,7 @@ from eap.config.mqtt import check_mqtt, mqtt_spec, warn_of_commands
 from eap.config.opcua import check_opcua, resolved_opcua, warn_of_open_channels
 from eap.config.opcua_sections import OpcUaSection
 from eap.config.pd_keys import check_key_files
+from eap.config.phases import derive_phases
 from eap.config.plant_sections import HostSection, PlantFile
 from eap.config.plant_users import check_plant_users, with_shared_users
 from eap.config.ports import IP_BROADCAST, check_ports, find_net_id, group_of, resolve_destination
@@ -109,34 +110,13 @@ from eap.pd.spec import (
     Writer,
 )
 
-STAGGER_GROUPS = 8
-"""Number of moments of the cycle over which the stations are spread.
-
-More moments spread the frames more evenly, but each wakes the engine: the fifteen stations of the
-solar line took 15 % of a core in fifteen groups and 12 % in eight, where half of them still start
-on time.
-"""
-MIN_STAGGER_US = 250
-"""Shortest distance between the starts of two groups."""
-
 
 def derive(index: Index, folder: Path) -> tuple[StationSpec, ...]:
     """Return the specification of every station; files are relative to *folder*."""
-    count = len(index.plant.stations)
     return tuple(
-        _station(index, station, _phase(index, station, position, count), folder)
-        for position, station in enumerate(index.plant.stations)
+        _station(index, station, phase_us, folder)
+        for station, phase_us in zip(index.plant.stations, derive_phases(index), strict=True)
     )
-
-
-def _phase(index: Index, station: StationSection, position: int, count: int) -> int:
-    if station.phase_us is not None:
-        return station.phase_us
-    cycle = index.cycle_us(station)
-    # Short cycles have fewer groups, so that a group ends before the next one begins.
-    groups = max(1, min(count, STAGGER_GROUPS, cycle // MIN_STAGGER_US))
-    # By turns: neighbours in the file are in different groups.
-    return position % groups * (cycle // groups)
 
 
 def _station(index: Index, station: StationSection, phase_us: int, folder: Path) -> StationSpec:

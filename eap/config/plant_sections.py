@@ -7,7 +7,14 @@ import msgspec
 from eap.config.bridge_sections import ModbusSection, MqttSection, S7Section
 from eap.config.opcua_sections import OpcUaSection
 from eap.config.record_sections import RecordSection
-from eap.config.structs import Defaults, PlantAccess, Section, StationSection, TypeSection
+from eap.config.structs import (
+    Defaults,
+    PlantAccess,
+    RealtimeSection,
+    Section,
+    StationSection,
+    TypeSection,
+)
 from eap.config.users import PlantUserSection
 from eap.config.web_sections import MetricsSection, WebSection
 
@@ -33,6 +40,7 @@ class PlantFile(Section, frozen=True, kw_only=True):
     plant: str
     stations: tuple[StationSection, ...]
     defaults: Defaults = Defaults()
+    realtime: RealtimeSection = RealtimeSection()
     access: PlantAccess = PlantAccess()
     users: tuple[PlantUserSection, ...] = ()
     types: dict[str, TypeSection] | tuple[str | dict[str, TypeSection], ...] = msgspec.field(

@@ -524,6 +524,12 @@ class Defaults(Section, frozen=True):
     pd_keys: str = ""
 
 
+class RealtimeSection(Section, frozen=True):
+    """Pace of the engine."""
+
+    groups: Annotated[int, Meta(ge=1, le=64)] | None = None
+
+
 class AuditMode(StrEnum):
     """Treatment of changes that the audit cannot record."""
 

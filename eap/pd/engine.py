@@ -14,16 +14,28 @@ from eap.pd.words import StationWord
 SOON_NS = 1_000_000_000
 """The start of the engine does not wait for a station whose cycle is longer."""
 
+_BEHIND_NS = int(StationWord.BEHIND_NS)
+_LATER_NS, _EARLIER_NS = 1000, 4000
+"""Changes of a station's place in a cycle: so that one cycle in five begins before its place."""
+
 
 class Engine:
-    """Runs each station when its cycle is due, and skips a cycle for which it is too late."""
+    """Runs each station when its cycle is due, and skips a cycle for which it is too late.
+
+    Stations that are due at the same moment are a group: one wake-up serves them, one after the
+    other, shorter cycles first.  The place of a station is its usual begin after the first one,
+    from which its lateness counts: what is the same in each cycle is no jitter.
+    """
 
     def __init__(self, stations: Sequence[Station]) -> None:
         self._stations = list(stations)
         self._arrivals: list[FrameChannel] = []
         self._buses: list[CyclicBus] = []
         self._others: list[CyclicBus] = []
-        self._due: list[tuple[int, int]] = []
+        self._due: list[tuple[int, int, int]] = []
+        """Due time, cycle time and index of each station."""
+        self._moment_ns = self._begun_ns = 0
+        """Due time and begin of the group that runs."""
 
     def drain_on_arrival(self, channels: Iterable[FrameChannel]) -> None:
         """Drain these channels as soon as :meth:`receive` is called."""
@@ -33,7 +45,11 @@ class Engine:
         """Bring all stations, with their present buses, to Op or to their state in *states*."""
         self._find_buses()
         self._due = [
-            (station.start(now_ns, states.get(station.spec.name, DeviceState.OP)), index)
+            (
+                station.start(now_ns, states.get(station.spec.name, DeviceState.OP)),
+                station.cycle_ns,
+                index,
+            )
             for index, station in enumerate(self._stations)
         ]
         heapify(self._due)
@@ -59,14 +75,17 @@ class Engine:
         self._stations[index] = new
         self._find_buses()
         if new.cycle_ns != old.cycle_ns:
-            by_station = {number: due_ns for due_ns, number in self._due}
+            by_station = {number: due_ns for due_ns, _, number in self._due}
             # Counted from the last cycle that ran, so that the first new interval is one new cycle
             # time.
             due_ns = by_station[index] - old.cycle_ns + new.cycle_ns
             by_station[index] = (
                 due_ns + max(0, -(-(now_ns - due_ns) // new.cycle_ns)) * new.cycle_ns
             )
-            self._due = [(due_ns, number) for number, due_ns in by_station.items()]
+            self._due = [
+                (due_ns, self._stations[number].cycle_ns, number)
+                for number, due_ns in by_station.items()
+            ]
             heapify(self._due)
 
     def stop(self) -> None:
@@ -89,19 +108,24 @@ class Engine:
         One a call, so that the caller reads the clock again before the next.  A station runs
         the timers of its own buses in its cycle, so a bus is late for no longer than that.
         """
-        due_ns, index = self._due[0]
+        due_ns, cycle_ns, index = self._due[0]
         if due_ns > now_ns:
             self._handle_bus(now_ns)
             return
         station = self._stations[index]
-        station.cycle(due_ns, now_ns)
+        if due_ns != self._moment_ns:
+            self._moment_ns, self._begun_ns = due_ns, now_ns
+            station.cycle(due_ns, now_ns)
+        else:
+            behind_ns = _shift_place(station.image.words, now_ns - self._begun_ns)
+            station.cycle(due_ns, now_ns, behind_ns)
         following_ns = due_ns + station.step_ns
         # Missed cycles are counted and not run late: a burst of them would delay all stations.
         if following_ns < now_ns:
-            missed = -(-(now_ns - following_ns) // station.cycle_ns)
+            missed = -(-(now_ns - following_ns) // cycle_ns)
             station.image.words[StationWord.OVERRUNS] += missed
-            following_ns += missed * station.cycle_ns
-        heapreplace(self._due, (following_ns, index))
+            following_ns += missed * cycle_ns
+        heapreplace(self._due, (following_ns, cycle_ns, index))
 
     def receive(self, now_ns: int) -> None:
         """Receive frames between cycles: of channels drained on arrival, and of buses."""
@@ -119,3 +143,17 @@ class Engine:
                 first, first_ns = bus, bus_ns
         if first is not None:
             first.handle_timeout(now_ns)
+
+
+def _shift_place(words: memoryview, behind_ns: int) -> int:
+    """Move a station's place in its group towards *behind_ns* and return it."""
+    place_ns: int = words[_BEHIND_NS]
+    later_ns = behind_ns - place_ns
+    if not place_ns:
+        place_ns = behind_ns
+    elif later_ns > 0:
+        place_ns += min(later_ns, _LATER_NS)
+    else:  # far before its place, which was that of a slow start, it moves in larger steps
+        place_ns -= min(-later_ns, max(_EARLIER_NS, -later_ns >> 4))
+    words[_BEHIND_NS] = place_ns
+    return place_ns

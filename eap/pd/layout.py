@@ -45,7 +45,7 @@ from eap.pd.words import FrameWord, RxWord, StationWord, TxWord
 # Header first, at fixed offsets: a program of another release finds the version, and stops, before
 # it relies on anything else.
 MAGIC = b"EAPIMAGE"
-LAYOUT_VERSION = 6
+LAYOUT_VERSION = 7
 HEADER = struct.Struct("<8sIIQQQ")
 """Magic, layout version, generation, offset and length of the directory, size of the file."""
 WORDS_OFFSET = 64

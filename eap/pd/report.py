@@ -5,6 +5,8 @@ docs/control.md describes the JSON shapes, which are a contract.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from operator import itemgetter
 from typing import Any, Literal
 
 import msgspec
@@ -104,6 +106,28 @@ def station_status(image: Image, now_ns: int, wall_ns: int | None = None) -> dic
             "rx": [_rx(image, slot, now_ns, wall_ns) for slot in layout.rx],
         },
     }
+
+
+def group_list(images: Iterable[Image]) -> list[dict[str, Any]]:
+    """Return the groups of stations that one wake-up of the engine serves, by cycle and phase.
+
+    A station is in none before its first cycle.  One that follows the clock of a bus has the phase
+    of its latest cycle.
+    """
+    groups: dict[tuple[int, int], list[Image]] = {}
+    for image in images:
+        cycle_us = image.layout.cycle_us
+        if at_ns := image.words[StationWord.CYCLE_AT_NS]:
+            groups.setdefault((cycle_us, at_ns // 1000 % cycle_us), []).append(image)
+    return [
+        {
+            "cycle_us": cycle_us,
+            "phase_us": phase_us,
+            "stations": [image.layout.station for image in group],
+            "last_us": max(image.words[StationWord.BEHIND_NS] for image in group) // 1000,
+        }
+        for (cycle_us, phase_us), group in sorted(groups.items(), key=itemgetter(0))
+    ]
 
 
 def _controllers(image: Image, now_ns: int) -> dict[str, Any]:

@@ -400,8 +400,8 @@ class Station:
             subscriber.release()
         self.image.release()
 
-    def cycle(self, due_ns: int, now_ns: int) -> None:
-        """Run one cycle that was due at *due_ns*."""
+    def cycle(self, due_ns: int, now_ns: int, behind_ns: int = 0) -> None:
+        """Run one cycle that was due at *due_ns*, and late if *behind_ns* later has passed."""
         words = self._words
         cycle = words[_CYCLE] + 1
         words[_CYCLE] = cycle  # one by one: pack_into would show readers a 0 in between
@@ -420,7 +420,7 @@ class Station:
         if self._closing:
             for close in self._closing:
                 close(now_ns)
-        late_ns = now_ns - due_ns
+        late_ns = now_ns - due_ns - behind_ns
         late_us = late_ns // 1000
         bin_ = BIN_OF_US[late_us] if 0 <= late_us < _BINS_KNOWN else histogram_bin(late_us)
         words[_LATENESS + bin_] += 1

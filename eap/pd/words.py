@@ -100,7 +100,9 @@ class StationWord(IntEnum):
     """Values that no link could pass on, because their source was infinite or no number."""
     SAMPLED_UNTIL = LINKS_HELD + 1
     """The last cycle of which a reader wants a sample; written by all readers of samples."""
-    SIZE = LINKS_HELD + 2
+    BEHIND_NS = LINKS_HELD + 2
+    """Usual time from the begin of its group until it runs behind others; 0 if it never did."""
+    SIZE = LINKS_HELD + 3
 
 
 class FrameWord(IntEnum):

@@ -18,7 +18,7 @@ from eap.ids import InterfaceUri
 from eap.net.interface import interface_of, is_there, link_is_up
 from eap.net.limits import ListenerStats
 from eap.pd.image import Image
-from eap.pd.report import station_status
+from eap.pd.report import group_list, station_status
 from eap.pd.spec import PortKind
 from eap.pd.words import StationWord
 from eap.runtime.bridges import BridgeStatus
@@ -126,7 +126,7 @@ async def take_snapshot(image: Image) -> Image:
 
 def appliance_status(
     info: ApplianceInfo,
-    images: Iterable[Image],
+    images: Sequence[Image],
     discarded: Sequence[Mapping[str, Mapping[str, int]]],
     meter: ProcessMeter,
     buses: Mapping[PortName, BusReport],
@@ -148,6 +148,7 @@ def appliance_status(
     engine = _process(info.engine, meter, now_ns)
     engine["realtime"] = info.engine.report.get("realtime", {})
     engine["compiled"] = info.engine.report.get("compiled")
+    engine["groups"] = group_list(images)
     if report := next(iter(buses.values()), None):
         engine["bus_requests"] = {"malformed": report.malformed, "dropped": report.dropped}
     processes = {

@@ -48,6 +48,17 @@ def test_engine_says_whether_its_cyclic_path_is_compiled(compiled: bool, shown: 
     assert row_of(show(status), "engine") == f"engine {shown} 101 4.2 % 35 MB 0"
 
 
+def test_groups_of_stations_with_the_time_of_their_last_one() -> None:
+    status = document()
+    names = [f"s{n}" for n in range(16)]
+    status["processes"]["engine"]["groups"] = [
+        {"cycle_us": 1000, "phase_us": 250, "stations": names, "last_us": 412}
+    ]
+    lines = show(status, width=80).splitlines()
+    first = lines.index("Group of cycle  Begins at  Stations  Last station after")
+    assert lines[first + 2].split() == ["1.0", "ms", "250", "µs", "16", "412", "µs"]
+
+
 @pytest.mark.parametrize("state", ["PREOP", "SAFEOP"])
 def test_pds_that_the_state_of_the_station_leaves_out_are_off(state: str) -> None:
     shown = show(document(state=state, tx=[tx("speed")], rx=[rx("left")]))

@@ -382,17 +382,6 @@ def test_ethernet_ports_join_groups_and_keep_their_tag(stations):
     assert (right.ports[0].vlan_id, right.ports[0].vlan_priority) == (7, 5)
 
 
-def test_stations_are_staggered_unless_they_say_when(stations):
-    assert [s.phase_us for s in stations()] == [0, 5000]
-    fast = ("plant: pair", "plant: pair\ndefaults: {cycle_us: 400}")
-    assert [s.phase_us for s in stations(fast)] == [0, 0]
-    quick = ("plant: pair", "plant: pair\ndefaults: {cycle_us: 500}")
-    assert [s.phase_us for s in stations(quick)] == [0, 250]
-    own = ("net_id: 127.0.9.2.1.1", "net_id: 127.0.9.2.1.1\n    phase_us: 7\n    cycle_us: 500")
-    right = stations(own)[1]
-    assert (right.phase_us, right.cycle_us) == (7, 500)
-
-
 def test_a_bus_port_is_complete(stations, tmp_path):
     left, _ = stations(bus_port())
     port = left.ports[1]

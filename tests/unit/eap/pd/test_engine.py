@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from eap.pd.engine import SOON_NS, Engine
 from eap.pd.spec import (
@@ -15,7 +17,7 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.station import Station
-from eap.pd.words import StationWord
+from eap.pd.words import HISTOGRAM_BINS, StationWord, bin_upper_edge, histogram_bin
 from tests.support.cyclic import (
     MS,
     PEER,
@@ -104,6 +106,86 @@ def test_cycles_that_are_missed_are_counted_and_left_out_and_the_grid_stays():
     assert engine.next_timeout() == 6 * MS
     engine.handle_timeout(6 * MS)
     assert [frame[10] for frame in wire.sent] == [1, 2, 3]
+
+
+def lateness_us(made: Station) -> list[int]:
+    """Return the upper edges of the bins with the lateness of all cycles of a station."""
+    bins = made.image.words[StationWord.LATENESS : StationWord.LATENESS + HISTOGRAM_BINS]
+    return [bin_upper_edge(n) for n, count in enumerate(bins) for _ in range(count)]
+
+
+def run_group(engine: Engine, stations: int, due_ns: int, *behind_us: int) -> None:
+    """Run a group of *stations*; the others begin *behind_us* after the first."""
+    for each in (0, *behind_us):
+        assert engine.next_timeout() == due_ns
+        engine.handle_timeout(due_ns + each * 1000)
+    assert len(behind_us) == stations - 1
+
+
+def test_lateness_in_a_group_counts_from_the_usual_place():
+    first, second, third = (make(name)[0] for name in ("a", "b", "c"))
+    engine = Engine([first, second, third])
+    engine.start(0)
+    for cycle in range(1, 11):
+        run_group(engine, 3, cycle * MS, 100, 300)
+    run_group(engine, 3, 11 * MS, 100, 500)
+    assert lateness_us(second) == [0] * 11
+    assert lateness_us(third) == [0] * 10 + [bin_upper_edge(histogram_bin(199))]
+    behind = [each.image.words[StationWord.BEHIND_NS] for each in (first, second, third)]
+    assert behind == [0, 100_000, 301_000]  # a single long cycle hardly moves a place
+
+
+def test_a_place_in_a_group_recovers_from_a_slow_start():
+    first, second = make("a")[0], make("b")[0]
+    engine = Engine([first, second])
+    engine.start(0)
+    run_group(engine, 2, MS, 900)
+    for cycle in range(2, 101):
+        run_group(engine, 2, cycle * MS, 50)
+    assert second.image.words[StationWord.BEHIND_NS] == 50_000
+
+
+def test_shorter_cycles_run_first_in_a_group_and_alone_have_no_place():
+    slow, slow_wire = make("slow", cycle_us=2000)
+    fast, fast_wire = make("fast")
+    engine = Engine([slow, fast])
+    engine.start(MS)
+    engine.handle_timeout(2 * MS)
+    assert (len(fast_wire.sent), len(slow_wire.sent)) == (1, 0)
+    engine.handle_timeout(2 * MS + 40_000)
+    engine.handle_timeout(3 * MS + 7000)  # fast alone
+    assert (len(fast_wire.sent), len(slow_wire.sent)) == (2, 1)
+    assert lateness_us(fast) == [0, 7]
+    assert fast.image.words[StationWord.BEHIND_NS] == 0
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([1, 2, 3, 5]), st.integers(0, 4)), min_size=1, max_size=6),
+    st.lists(st.integers(0, 2 * MS), min_size=10, max_size=60),
+)
+def test_every_station_runs_or_leaves_out_each_of_its_cycles(shapes, delays_ns):
+    made = [
+        make(f"s{n}", cycle_us=cycle * 1000, phase_us=min(phase, cycle - 1) * 1000)[0]
+        for n, (cycle, phase) in enumerate(shapes)
+    ]
+    engine, now_ns = Engine(made), 0
+    first = {id(each): each.spec.phase_us * 1000 or each.cycle_ns for each in made}
+    engine.start(0)
+    for delay_ns in delays_ns:
+        now_ns = max(now_ns, engine.next_timeout()) + delay_ns
+        engine.handle_timeout(now_ns)
+    for each in made:
+        words = each.image.words
+        cycles = words[StationWord.CYCLE]
+        assert sum(words[StationWord.LATENESS : StationWord.LATENESS + HISTOGRAM_BINS]) == cycles
+        assert 0 <= words[StationWord.BEHIND_NS] <= now_ns
+        if cycles:  # the grid of due times has neither a gap nor an extra cycle
+            due_ns = words[StationWord.CYCLE_AT_NS]
+            assert due_ns % each.cycle_ns == first[id(each)] % each.cycle_ns
+            left_out = words[StationWord.OVERRUNS]
+            ran = (due_ns - first[id(each)]) // each.cycle_ns + 1
+            # Those that a cycle leaves out lie behind it.
+            assert cycles <= ran <= cycles + left_out
 
 
 def test_generated_values_after_skipped_cycles_and_restart_are_those_of_their_time():

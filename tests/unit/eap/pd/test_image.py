@@ -290,7 +290,7 @@ def damaged(change: str) -> memoryview:
     [
         ("short", "shorter than the header"),
         ("magic", "magic is missing"),
-        ("version", "layout version 7, this program knows 6"),
+        ("version", "layout version 8, this program knows 7"),
         ("cut", "cut off"),
         ("length", "cut off"),
         ("directory", "damaged directory"),
@@ -317,7 +317,7 @@ def test_the_header_is_where_other_languages_expect_it():
     memory = memoryview(bytearray(layout.size))
     format_image(memory, layout, 3)
     assert bytes(memory[:8]) == b"EAPIMAGE"
-    assert struct.unpack_from("<IIQ", memory, 8) == (6, 3, layout.directory_offset)
+    assert struct.unpack_from("<IIQ", memory, 8) == (7, 3, layout.directory_offset)
 
 
 def make() -> Image:

@@ -14,6 +14,7 @@ from eap.pd.publisher import enter_refused, enter_sent, enter_skipped, enter_sup
 from eap.pd.report import (
     frame_state,
     frame_status,
+    group_list,
     pd_list,
     quality,
     station_status,
@@ -163,6 +164,27 @@ def test_a_station_before_its_start_is_in_init():
     assert status["lateness_us"] == {"p50": None, "p99": None, "max": None}
     image.words[StationWord.STATE] = 8
     assert station_status(image, 0)["state"] == "OP"
+
+
+def test_groups_have_their_stations_by_cycle_and_phase():
+    def ran(name: str, at_ns: int, behind_ns: int = 0, cycle_us: int = 1000) -> Image:
+        image = image_of(station(name, cycle_us=cycle_us))
+        image.words[StationWord.CYCLE_AT_NS] = at_ns
+        image.words[StationWord.BEHIND_NS] = behind_ns
+        return image
+
+    images = [
+        ran("slow", 7 * MS, 90_000, cycle_us=2000),
+        ran("a", 3 * MS),
+        ran("new", 0),
+        ran("half", 3 * MS + 500_000),
+        ran("b", 7 * MS, 41_999),
+    ]
+    assert group_list(images) == [
+        {"cycle_us": 1000, "phase_us": 0, "stations": ["a", "b"], "last_us": 41},
+        {"cycle_us": 1000, "phase_us": 500, "stations": ["half"], "last_us": 0},
+        {"cycle_us": 2000, "phase_us": 1000, "stations": ["slow"], "last_us": 90},
+    ]
 
 
 def test_members_of_one_tracker_report_the_same_counters_and_their_own_discards():

@@ -115,6 +115,8 @@ def test_the_document_has_the_shape_of_the_contract(files, monkeypatch):
     assert processes["engine"]["restarts"] == 2
     assert processes["engine"]["realtime"] == {"scheduler": "fifo 50"}
     assert processes["engine"]["compiled"] is True
+    group = {"cycle_us": 10_000, "phase_us": 0, "stations": ["right"], "last_us": 0}
+    assert processes["engine"]["groups"] == [group]
     assert processes["services"] == {"pid": None, **status.NOTHING_MEASURED, "restarts": 1}
     assert document["listeners"] == [
         {
