@@ -1,4 +1,4 @@
-/* One batch of recvmmsg for the handlers of a socket.
+/* Messages of a socket, by batches of recvmmsg, for its handlers.
 
    eap/net/mmsg.py, udp.py and ethernet.py are the reference.  */
 
@@ -7,7 +7,7 @@
 #include <netinet/in.h>
 #include <time.h>
 
-enum { MAX_BATCHES = 4, CLOCK_NOISE_NS = 1000, SENDER = sizeof(struct sockaddr_in) };
+enum { MAX_BATCHES = 4, CLOCK_NOISE_NS = 1000, SENDER = sizeof(struct sockaddr_in), TAG_AT = 64 };
 #define BILLION 1000000000LL
 
 typedef struct {
@@ -154,13 +154,66 @@ static int hand_over(Receiver *self, Py_ssize_t n, Py_ssize_t size, int64_t at_n
     return done == NULL ? -1 : 0;
 }
 
-/* Return the handlers of a frame of Ethernet by *routes*, borrowed; NULL if there are none. */
+/* ---- Drain: reading of one socket ---- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *receiver, *handlers, *origin;
+    int fd;
+    char is_paused;
+} Drain;
+
+static int drain_clear(Drain *self) {
+    Py_CLEAR(self->handlers);
+    return 0;
+}
+
+static int drain_traverse(Drain *self, visitproc visit, void *arg) {
+    Py_VISIT(Py_TYPE((PyObject *)self));
+    Py_VISIT(self->handlers);
+    return 0;
+}
+
+static void drain_dealloc(Drain *self) {
+    PyObject_GC_UnTrack(self);
+    drain_clear(self);
+    Py_XDECREF(self->receiver);
+    Py_XDECREF(self->origin);
+    free_object((PyObject *)self);
+}
+
+/* Drain(receiver, fd, handlers, origin): *handlers* is a list, or those of a packet socket by VLAN
+   and address.  To *origin*, of which only a weak reference is kept, the frames are said to belong;
+   its drain() is called while is_paused.  */
+static PyObject *drain_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
+    PyObject *receiver, *handlers, *origin;
+    int fd;
+    if (!PyArg_ParseTuple(args, "O!iOO", receiver_type, &receiver, &fd, &handlers, &origin))
+        return NULL;
+    const Receiver *batch = (Receiver *)receiver;
+    if (PyDict_Check(handlers) ? batch->control_size < TAG_AT + 2
+                               : !PyList_Check(handlers) || batch->senders.buf == NULL)
+        return PyErr_Format(PyExc_TypeError, "a list of handlers, or routes of a packet socket");
+    Drain *self = (Drain *)make_object(type, keywords);
+    if (self == NULL)
+        return NULL;
+    Py_INCREF(receiver);
+    self->receiver = receiver;
+    Py_INCREF(handlers);
+    self->handlers = handlers;
+    self->fd = fd;
+    if ((self->origin = PyWeakref_NewRef(origin, NULL)) == NULL)
+        Py_CLEAR(self);
+    return (PyObject *)self;
+}
+
+/* Return the handlers of message *n* by routes, borrowed; NULL if there are none. */
 static PyObject *handlers_for(Receiver *self, PyObject *routes, Py_ssize_t n) {
     uint64_t head, mask = 0;
     uint16_t tag;
     memset(&mask, 0xFF, 6);
     memcpy(&head, (char *)self->octets.buf + n * self->buffer_size, sizeof head);
-    memcpy(&tag, (char *)self->control.buf + n * self->control_size + 64, sizeof tag);
+    memcpy(&tag, (char *)self->control.buf + n * self->control_size + TAG_AT, sizeof tag);
     PyObject *vlan = PyLong_FromLong(tag & 0x0FFF);
     if (vlan == NULL)
         return NULL;
@@ -178,33 +231,30 @@ static PyObject *handlers_for(Receiver *self, PyObject *routes, Py_ssize_t n) {
 
 /* Hand a batch over; return how many messages had a handler, -1 for an error. */
 static Py_ssize_t hand_over_batch(Receiver *self, Py_ssize_t count, PyObject *handlers,
-                                  PyObject *unrouted, PyObject *origin) {
+                                  PyObject *origin) {
     int64_t now_ns = read_clocks(self);
     Py_ssize_t taken = 0;
     for (Py_ssize_t n = 0; n < count; n++) {
         int64_t at_ns = arrival_ns(self, n, now_ns);
         PyObject *list = handlers;
-        if (unrouted != Py_None && (list = handlers_for(self, handlers, n)) == NULL) {
-            if (PyErr_Occurred())
-                return -1;
-            PyObject *counted = PyObject_CallFunction(unrouted, "n", n);
+        if (PyDict_Check(handlers) && (list = handlers_for(self, handlers, n)) == NULL) {
+            PyObject *counted = PyErr_Occurred()
+                                    ? NULL : PyObject_CallMethod(origin, "count_unrouted", "n", n);
             Py_XDECREF(counted);
             if (counted == NULL)
                 return -1;
             continue;
         }
-        if (!PyList_Check(list)) {
-            refuse("handlers are in a list");
-            return -1;
-        }
+        if (!PyList_Check(list))
+            return refuse("handlers are in a list");
         Py_INCREF(list);  /* a handler may exchange it */
         int failed = 0;
         taken += PyList_Size(list) > 0;
         for (Py_ssize_t i = 0; !failed && i < PyList_Size(list); i++) {
             PyObject *handler = PyList_GetItem(list, i);
             Py_INCREF(handler);
-            failed = hand_over(self, n, (Py_ssize_t)self->headers[n].msg_len - self->headroom, at_ns,
-                               handler, origin);
+            failed = hand_over(self, n, (Py_ssize_t)self->headers[n].msg_len - self->headroom,
+                               at_ns, handler, origin);
             Py_DECREF(handler);
         }
         Py_DECREF(list);
@@ -214,59 +264,85 @@ static Py_ssize_t hand_over_batch(Receiver *self, Py_ssize_t count, PyObject *ha
     return taken;
 }
 
-/* drain(fd, handlers, unrouted, origin, note_error): hand all waiting messages over, at most four
-   batches; return how many had a handler.  With *unrouted*, *handlers* has those of each VLAN and
-   address, and *unrouted* gets the position of each other message.  *note_error* gets an errno, and
-   returns whether messages may still wait.  */
-static PyObject *receiver_drain(Receiver *self, PyObject *args) {
-    int fd;
-    PyObject *handlers, *unrouted, *origin, *note;
+/* Read at most MAX_BATCHES; *handlers* and *origin* stay alive. */
+static Py_ssize_t receive_batches(Receiver *self, int fd, PyObject *handlers, PyObject *origin) {
     Py_ssize_t total = 0;
-    if (!PyArg_ParseTuple(args, "iOOOO", &fd, &handlers, &unrouted, &origin, &note))
-        return NULL;
-    if (unrouted != Py_None ? !PyDict_Check(handlers) || self->control_size < 66
-                            : !PyList_Check(handlers) || self->senders.buf == NULL)
-        return PyErr_Format(PyExc_TypeError, "a list of handlers, or routes of a packet socket");
-    if (self->busy)
-        return PyErr_Format(PyExc_RuntimeError, "the batch is in use");
-    self->busy = 1;
     for (int batch = 0; batch < MAX_BATCHES; batch++) {
         int count = recvmmsg(fd, self->headers, (unsigned)self->count, MSG_DONTWAIT, NULL);
         if (count < 0 && errno == EAGAIN)
             break;
         if (count < 0) {
-            PyObject *again = PyObject_CallFunction(note, "i", errno);
+            PyObject *again = PyObject_CallMethod(origin, "note_error", "i", errno);
             int goes_on = again == NULL ? -1 : PyObject_IsTrue(again);
             Py_XDECREF(again);
             if (goes_on < 0)
-                goto failed;
+                return -1;
             if (!goes_on)
                 break;
             continue;
         }
-        Py_ssize_t taken = hand_over_batch(self, count, handlers, unrouted, origin);
+        Py_ssize_t taken = hand_over_batch(self, count, handlers, origin);
         if (taken < 0)
-            goto failed;
+            return -1;
         total += taken;
         if (count == 1 || count < self->count)
             break;
     }
-    self->busy = 0;
-    return PyLong_FromSsize_t(total);
-failed:
-    self->busy = 0;
-    return NULL;
+    return total;
 }
 
-static PyMethodDef receiver_methods[] = {
-    {"drain", (PyCFunction)receiver_drain, METH_VARARGS, NULL},
-    {NULL, NULL, 0, NULL},
-};
+Py_ssize_t drain(PyObject *object) {
+    Drain *self = (Drain *)object;
+    Receiver *receiver = (Receiver *)self->receiver;
+    PyObject *origin = PyWeakref_GetObject(self->origin), *handlers = self->handlers;
+    if (origin == Py_None || handlers == NULL)
+        return 0;
+    Py_ssize_t total = -1;
+    Py_INCREF(object);
+    Py_INCREF(origin);
+    Py_INCREF(handlers);
+    if (self->is_paused) {
+        PyObject *count = PyObject_CallMethod(origin, "drain", NULL);
+        total = count == NULL ? -1 : PyLong_AsSsize_t(count);
+        Py_XDECREF(count);
+    } else if (receiver->busy)
+        PyErr_Format(PyExc_RuntimeError, "the batch is in use");
+    else {
+        receiver->busy = 1;
+        total = receive_batches(receiver, self->fd, handlers, origin);
+        receiver->busy = 0;
+    }
+    Py_DECREF(handlers);
+    Py_DECREF(origin);
+    Py_DECREF(object);
+    return total;
+}
+
+/* drain(now_ns) */
+static PyObject *drain_call(PyObject *self, PyObject *args, PyObject *keywords) {
+    (void)args;
+    (void)keywords;
+    Py_ssize_t total = drain(self);
+    return total < 0 ? NULL : PyLong_FromSsize_t(total);
+}
+
 static PyType_Slot receiver_slots[] = {
-    {Py_tp_new, receiver_new}, {Py_tp_dealloc, receiver_dealloc},
-    {Py_tp_methods, receiver_methods}, {0, NULL},
+    {Py_tp_new, receiver_new}, {Py_tp_dealloc, receiver_dealloc}, {0, NULL},
 };
 PyType_Spec receiver_spec = {
     "eap._cyclic.Receiver", sizeof(Receiver), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_IMMUTABLETYPE,
     receiver_slots,
+};
+static PyMemberDef drain_members[] = {
+    {"is_paused", T_BOOL, offsetof(Drain, is_paused), 0, NULL},
+    {NULL, 0, 0, 0, NULL},
+};
+static PyType_Slot drain_slots[] = {
+    {Py_tp_new, drain_new}, {Py_tp_dealloc, drain_dealloc}, {Py_tp_call, drain_call},
+    {Py_tp_traverse, drain_traverse}, {Py_tp_clear, drain_clear}, {Py_tp_members, drain_members},
+    {0, NULL},
+};
+PyType_Spec drain_spec = {
+    "eap._cyclic.Drain", sizeof(Drain), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_IMMUTABLETYPE, drain_slots,
 };

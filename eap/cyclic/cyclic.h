@@ -20,12 +20,19 @@
 #include <string.h>
 #include <sys/socket.h>
 
-/* Offsets of words in the image: OFFSETS has those that Python compares. */
-enum { STATION_CYCLE = 0, STATION_SEQUENCE = 4 };
+/* Words of the image, and other numbers that Python compares as OFFSETS. */
+enum { STATION_CYCLE, STATION_CYCLE_AT_NS, STATION_FUTEX, STATION_WAITERS, STATION_SEQUENCE,
+       STATION_SERVICES, STATION_APPLICATION, STATION_OVERRUNS = 14, STATION_LATENESS_MAX_NS = 16,
+       STATION_LATENESS = 34, BINS = 64, STATION_SAMPLED_UNTIL = STATION_LATENESS + BINS + 1,
+       STATION_WORDS };
+enum { RX_TRACKER, RX_RESPONSE_NS = 3, RX_RECEIVED = 26 };
+/* Of a tracker, which begins at RX_RECEIVED of its block and reaches to the end. */
 enum { RECEIVED, DUPLICATED, REORDERED, LATE, STATE = 7, LAST_CYCLE, ARRIVED_AT_NS,
-       ARRIVED_IN_CYCLE, BEHIND, JITTER_MAX_US = 15, JITTER, BINS = 64,
-       TRACKER_WORDS = JITTER + BINS };
-enum { CYCLE_AT = 10, FIRST_PD = 14, PD_HEADER = 8, SHORTEST = FIRST_PD + PD_HEADER };
+       ARRIVED_IN_CYCLE, BEHIND, JITTER_MAX_US = 15, JITTER, TRACKER_WORDS = JITTER + BINS,
+       RX_WORDS = RX_RECEIVED + TRACKER_WORDS };
+enum { CYCLE_AT = 10, FIRST_PD = 14, PD_HEADER = 8, SHORTEST = FIRST_PD + PD_HEADER,
+       PD_LENGTH = 4, PD_QUALITY = 6 };
+enum { QUALITY_MAX = 0xFFFF, QUALITY_NS = 100000, WAKE_FOR_CYCLES = 100 };
 enum { WORD = sizeof(int64_t), MAX_INDEX = 1 << 30 };
 /* Times and periods that are computed with: far below an overflow of their sums and products. */
 #define MAX_NS (1LL << 61)
@@ -65,6 +72,9 @@ int need(int64_t *needed, int64_t first, int64_t count);
 PyObject *make_object(PyTypeObject *type, PyObject *keywords);
 void free_object(PyObject *self);
 
+/* Return a copy of *octets* that is aligned for words. */
+void *copy_of(const char *octets, Py_ssize_t size);
+
 /* Release *buffer*, so that nothing can be read there any more. */
 void release_buffer(Py_buffer *buffer);
 
@@ -81,10 +91,23 @@ typedef struct {
 Result take(PortHandler *self, const uint8_t *data, Py_ssize_t size, int64_t at_ns,
             const uint8_t *source, Py_ssize_t source_size);
 
-/* ---- Types, made by module.c ---- */
+/* ---- batch.c ---- */
 
-extern PyTypeObject *plan_type, *handler_type;
-extern PyType_Spec plan_spec, handler_spec, receiver_spec;
-extern PyObject *text_fast, *text_source, *text_source_of, *text_wanted;
+/* Hand over what waits at the socket of a Drain; return how many frames had a handler, or -1. */
+Py_ssize_t drain(PyObject *self);
+
+/* ---- send.c ---- */
+
+/* Send the frames of a SendPlan that are due through *channel*, and count them; -1 for an error. */
+int send_due(PyObject *plan, PyObject *publisher, PyObject *channel, PyObject *now);
+
+/* ---- Types, made by module.c, and interned texts ---- */
+
+extern PyTypeObject *plan_type, *handler_type, *receiver_type, *drain_type, *patch_type,
+    *send_plan_type;
+extern PyType_Spec plan_spec, handler_spec, receiver_spec, drain_spec, patch_spec, send_plan_spec,
+    cycle_spec;
+extern PyObject *text_fast, *text_source, *text_source_of, *text_wanted, *text_direct, *text_send,
+    *text_address_of, *text_plan;
 
 #endif

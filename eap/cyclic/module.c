@@ -5,29 +5,40 @@
 #include <stdlib.h>
 
 /* Parameters, plans and offsets as eap/compiled.py gives them; raised when either side changes. */
-#define API 2
+#define API 3
 
-PyTypeObject *plan_type, *handler_type;
-static PyTypeObject *receiver_type;
-PyObject *text_fast, *text_source, *text_source_of, *text_wanted;
+PyTypeObject *plan_type, *handler_type, *receiver_type, *drain_type, *patch_type, *send_plan_type;
+static PyTypeObject *cycle_type;
+PyObject *text_fast, *text_source, *text_source_of, *text_wanted, *text_direct, *text_send,
+    *text_address_of, *text_plan;
 
 static const struct {
     PyType_Spec *spec;
     PyTypeObject **type;
 } types[] = {
-    {&plan_spec, &plan_type},
-    {&handler_spec, &handler_type},
-    {&receiver_spec, &receiver_type},
+    {&plan_spec, &plan_type},         {&handler_spec, &handler_type},
+    {&receiver_spec, &receiver_type}, {&drain_spec, &drain_type},
+    {&patch_spec, &patch_type},       {&send_plan_spec, &send_plan_type},
+    {&cycle_spec, &cycle_type},
 };
 
 static const struct {
     PyObject **text;
     const char *value;
 } texts[] = {
-    {&text_fast, "fast"},
-    {&text_source, "source"},
-    {&text_source_of, "source_of"},
-    {&text_wanted, "wanted"},
+    {&text_fast, "fast"},     {&text_source, "source"}, {&text_source_of, "source_of"},
+    {&text_wanted, "wanted"}, {&text_direct, "direct"}, {&text_send, "send"},
+    {&text_plan, "plan"},     {&text_address_of, "address_of"},
+};
+
+/* In the order of eap/pd/compiledplan.py. */
+static const int offsets[] = {
+    STATION_CYCLE, STATION_CYCLE_AT_NS, STATION_FUTEX, STATION_WAITERS, STATION_SEQUENCE,
+    STATION_SERVICES, STATION_APPLICATION, STATION_OVERRUNS, STATION_LATENESS_MAX_NS,
+    STATION_LATENESS, STATION_SAMPLED_UNTIL, STATION_WORDS, RX_TRACKER, RX_RESPONSE_NS, RX_RECEIVED,
+    RX_WORDS, DUPLICATED, LATE, STATE, LAST_CYCLE, ARRIVED_AT_NS, ARRIVED_IN_CYCLE, BEHIND,
+    JITTER_MAX_US, JITTER, TRACKER_WORDS, CYCLE_AT, FIRST_PD, QUALITY_MAX, QUALITY_NS,
+    WAKE_FOR_CYCLES,
 };
 
 int refuse(const char *what) {
@@ -55,6 +66,15 @@ void free_object(PyObject *self) {
     Py_DECREF(type);
 }
 
+void *copy_of(const char *octets, Py_ssize_t size) {
+    void *copy = PyMem_Malloc((size_t)size + 1);
+    if (copy == NULL)
+        PyErr_NoMemory();
+    else
+        memcpy(copy, octets, (size_t)size);
+    return copy;
+}
+
 void release_buffer(Py_buffer *buffer) {
     PyBuffer_Release(buffer);
     memset(buffer, 0, sizeof *buffer);
@@ -71,12 +91,13 @@ static int fill(PyObject *module) {
             return -1;
         *types[n].type = (PyTypeObject *)type;
     }
-    PyObject *offsets = Py_BuildValue(
-        "(iiiiiiiiiiiiiii)", STATION_CYCLE, STATION_SEQUENCE, RECEIVED, DUPLICATED, LATE, STATE,
-        LAST_CYCLE, ARRIVED_AT_NS, ARRIVED_IN_CYCLE, BEHIND, JITTER_MAX_US, JITTER, TRACKER_WORDS,
-        CYCLE_AT, FIRST_PD);
-    int failed = offsets == NULL || PyModule_AddObjectRef(module, "OFFSETS", offsets);
-    Py_XDECREF(offsets);
+    Py_ssize_t count = sizeof offsets / sizeof *offsets;
+    PyObject *all = PyTuple_New(count);
+    for (Py_ssize_t n = 0; all != NULL && n < count; n++)
+        if (PyTuple_SetItem(all, n, PyLong_FromLong(offsets[n])))
+            Py_CLEAR(all);
+    int failed = all == NULL || PyModule_AddObjectRef(module, "OFFSETS", all);
+    Py_XDECREF(all);
     return failed ? -1 : PyModule_AddIntConstant(module, "API", API);
 }
 

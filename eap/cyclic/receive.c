@@ -6,7 +6,7 @@
 
 #include "cyclic.h"
 
-enum { SM_AT = 13, PD_COMPARED = 6, PD_LENGTH = 4 };
+enum { SM_AT = 13, PD_COMPARED = 6 };
 enum { KEY_HEAD = 10, KEY_TAIL = 7 };
 enum { RUNNING = 1, NEAR = 0x3FFF };
 
@@ -39,16 +39,6 @@ static void plan_dealloc(Plan *self) {
     PyMem_Free(self->parts);
     PyMem_Free(self->counters);
     free_object((PyObject *)self);
-}
-
-/* Return a copy of *octets* that is aligned for words. */
-static void *copy_of(const char *octets, Py_ssize_t size) {
-    void *copy = PyMem_Malloc((size_t)size + 1);
-    if (copy == NULL)
-        PyErr_NoMemory();
-    else
-        memcpy(copy, octets, (size_t)size);
-    return copy;
 }
 
 static Py_ssize_t pd_size(const uint8_t *header) {

@@ -302,7 +302,8 @@ class PortChannels:
 def _drain_of(channel: UdpChannel | EthernetInterface) -> Callable[[int], object]:
     if isinstance(channel, UdpChannel):
         return channel.drain
-    return lambda now_ns: channel.drain()
+    drain: Callable[[int], object] = channel.compiled_drain or (lambda now_ns: channel.drain())
+    return drain
 
 
 def _tcp_reason(closed: str) -> DropReason | None:

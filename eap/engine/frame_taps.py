@@ -48,6 +48,8 @@ class FrameTap:
 class _RecordingChannel(ChannelLayer):
     """A channel whose sent frames are recorded."""
 
+    direct = None
+
     def __init__(self, channel: FrameChannel, ring: FrameRingWriter, number: int) -> None:
         super().__init__(channel)
         self._ring = ring

@@ -11,6 +11,7 @@ from ctypes import get_errno
 from errno import EAGAIN, ENETDOWN
 
 from eap.codec.ethercat import ETHERTYPE
+from eap.compiled import override
 from eap.ids import BROADCAST_MAC, EAP_MULTICAST_MAC, Destination, MacAddr
 from eap.net.mmsg import BATCH, BUFFER_SIZE, ReceiveBatch, SendBatch, note_receive_error
 from eap.net.packetsocket import InterfaceBinding
@@ -70,8 +71,6 @@ class EthernetInterface:
         self._sock = sock
         self._batch = batch
         self._receive = batch.reader(sock.fileno())
-        self._fd = sock.fileno()
-        self._compiled = batch.compiled()
         self._octets = batch.octets
         self._heads = batch.octets.cast("Q")
         self._tags = batch.control.cast("H")
@@ -80,6 +79,8 @@ class EthernetInterface:
         self._ports: list[EthernetPort] = []
         self.has_neighbours = False
         self._local: deque[tuple[FrameHandler, memoryview, int]] = deque()
+        self.compiled_drain = batch.compiled_drain(sock.fileno(), self._routes, self)
+        self._pause_compiled()
 
     def port(
         self,
@@ -118,8 +119,7 @@ class EthernetInterface:
         for address in (self.address, BROADCAST_MAC, *port.groups):
             by_address.setdefault(_key(address), []).append(port.handler)
         self._ports.append(port)
-        # Copies for other ports cost time in each cycle, so a single port makes none.
-        self.has_neighbours = len(self._ports) > 1
+        self._count_ports()
         if port.own_address != self.address:
             port.readdress()
 
@@ -128,7 +128,7 @@ class EthernetInterface:
         # The socket stays a member of the port's groups: to leave one waits for a lock of the
         # kernel, and this is called between two cycles.
         self._ports.remove(port)
-        self.has_neighbours = len(self._ports) > 1
+        self._count_ports()
         by_address = self._routes[port.vlan_id]
         for address in (self.address, BROADCAST_MAC, *port.groups):
             by_address[_key(address)].remove(port.handler)
@@ -138,21 +138,27 @@ class EthernetInterface:
             del self._routes[port.vlan_id]
         self._local = deque(each for each in self._local if each[0] != port.handler)
 
+    def _count_ports(self) -> None:
+        # Copies for other ports cost time in each cycle, so a single port makes none.
+        self.has_neighbours = len(self._ports) > 1
+        for port in self._ports:
+            port.find_direct()
+
+    def _pause_compiled(self) -> None:
+        """Leave to Python what the compiled part does not know of."""
+        if self.compiled_drain is not None:
+            self.compiled_drain.is_paused = bool(self._local) or self._binding.is_lost
+
     def drain(self) -> int:
         """Hand every waiting frame to the ports it is for; return how many were handed over."""
         total = self._drain_local() if self._local else 0
-        if self._compiled is not None and not self._binding.is_lost:
-            count: int = self._compiled.drain(
-                self._fd, self._routes, self._find_handlers, self, self._note_error
-            )
-            return total + count
         for _ in range(_BATCHES_PER_DRAIN):
             count = self._receive()
             if count == 1:
                 return total + self._dispatch_one()
             if count < 0:
                 if self._binding.is_lost or get_errno() != EAGAIN:
-                    self._note_error(get_errno())
+                    self.note_error(get_errno())
                 break
             total += self._dispatch(count)
             if count < BATCH:
@@ -161,7 +167,9 @@ class EthernetInterface:
 
     def find(self) -> None:
         """Look for an interface that was deleted: has it been made again?"""
-        if not self._binding.find():
+        is_found = self._binding.find()
+        self._pause_compiled()
+        if not is_found:
             return
         before, self.address = self.address, self._binding.address
         if self.address != before:
@@ -191,6 +199,7 @@ class EthernetInterface:
                     self.discarded["local_overflow"] += 1
                 else:
                     self._local.append((handler, data, now_ns))
+        self._pause_compiled()
 
     def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
         """Hand to *new* the frames that were handed to *old*, if it is a handler here."""
@@ -227,19 +236,20 @@ class EthernetInterface:
         """Close the socket."""
         self._sock.close()
 
-    def _note_error(self, number: int) -> bool:
+    def note_error(self, number: int) -> bool:
         """Note why nothing was received; return False, for nothing waits behind it."""
         if number == ENETDOWN:
             # Once, for switched off as for deleted.
             self._binding.is_lost = True
+            self._pause_compiled()
         note_receive_error(self.errors, number)
         self.find()
         return False
 
-    def _find_handlers(self, position: int) -> Sequence[FrameHandler]:
-        """Return the handlers of the frame at *position* in the batch, as :meth:`_handlers`."""
+    def count_unrouted(self, position: int) -> None:
+        """Count the frame at *position* in the batch, if it is of an unknown VLAN."""
         head = self._heads[position * (BUFFER_SIZE // 8)]
-        return self._handlers(head, self._tags[position * (_CONTROL_SIZE // 2) + _TCI])
+        self._handlers(head, self._tags[position * (_CONTROL_SIZE // 2) + _TCI])
 
     def _dispatch_one(self) -> int:
         handlers = self._handlers(self._heads[0], self._tags[_TCI])
@@ -285,6 +295,7 @@ class EthernetInterface:
         for _ in range(count):
             handle, data, at_ns = self._local.popleft()
             handle(data, len(data), at_ns, self)
+        self._pause_compiled()
         return count
 
 
@@ -307,6 +318,9 @@ class EthernetPort:
         self.groups = groups
         self.own_address = interface.address
         self._send = interface.sender.send
+        self._is_readdressed = False
+        self.direct: SendBatch | None = None
+        override(self, "drain", interface.compiled_drain)
         # VID 0 with a priority is a priority tag (802.1Q); without both the frame is untagged.
         tag = priority << 13 | vlan_id
         self._tag = struct.pack("!HH", _TPID, tag) if tag else b""
@@ -332,6 +346,13 @@ class EthernetPort:
         """Write the interface's present address into each frame that is sent from now on."""
         # Frames are prebuilt, by publishers and repliers; only sending sees all of them.
         self._send = self._send_readdressed
+        self._is_readdressed = True
+        self.find_direct()
+
+    def find_direct(self) -> None:
+        """Note whether :meth:`send` does more than to hand frames to the socket."""
+        plain = not (self.interface.has_neighbours or self._is_readdressed)
+        self.direct = self.interface.sender if plain else None
 
     def link_header(self, destination: str) -> bytes:
         """Return destination, own address, the port's VLAN tag if it has one, and EtherType."""

@@ -82,6 +82,7 @@ class LoopbackChannel:
     """
 
     minimum_size = 0
+    direct = None
 
     def __init__(self, ports: list[LoopbackChannel], faults: Faults) -> None:
         self.handlers: list[FrameHandler] = []

@@ -136,13 +136,22 @@ class ReceiveBatch:
         headers = ctypes.c_void_p(_address(self._headers))
         return partial(_recvmmsg, fd, headers, BATCH, socket.MSG_DONTWAIT, None)
 
-    def compiled(self) -> Any:
-        """Return the compiled receiver of this memory; None without compiled part.
+    def compiled_drain(self, fd: int, handlers: object, origin: object) -> Any:
+        """Return what drains a socket into this memory; None without compiled part.
 
-        Its ``drain`` does what the channels of this package do by :meth:`reader`, and calls
-        compiled handlers without a detour.
+        It does what the channels of this package do by :meth:`reader`, and calls compiled handlers
+        without a detour.
+
+        Args:
+            fd: Of the socket.
+            handlers: A list, or those of an Ethernet interface by VLAN and address.
+            origin: Its ``note_error`` is called for errors, its ``count_unrouted`` for frames
+                without handlers, and its ``drain`` in place of all that as long as ``is_paused``
+                of the result is true.
         """
-        if self._compiled is None and cyclic is not None:
+        if cyclic is None:
+            return None
+        if self._compiled is None:
             self._compiled = cyclic.Receiver(
                 self.octets,
                 self._control,
@@ -151,7 +160,7 @@ class ReceiveBatch:
                 self._headroom,
                 self.views,
             )
-        return self._compiled
+        return cyclic.Drain(self._compiled, fd, handlers, origin)
 
     def arrival(self) -> tuple[memoryview, int, int]:
         """Return view, whole size and monotonic arrival time of the only message of a batch."""
@@ -281,31 +290,43 @@ class SendBatch:
 
     def _send_many(self, frames: Sequence[OutFrame]) -> Sequence[OutFrame]:
         key = tuple(frames)
-        batch = self._batches.get(key)
-        if batch is None:
-            batch = self._prepare(key)
-        sent = batch[0]()
-        return () if sent == len(key) else self._send_rest(key, batch[1], sent)
+        sent = (self._batches.get(key) or self._prepare(key))[0]()
+        return () if sent == len(key) else self.go_on(key, sent, ctypes.get_errno())
 
-    def _send_rest(
-        self, frames: tuple[OutFrame, ...], headers: bytearray, sent: int
-    ) -> list[OutFrame]:
-        """Continue behind the first *sent* frames; each frame that fails is skipped."""
+    def go_on(self, frames: Sequence[OutFrame], sent: int, number: int) -> list[OutFrame]:
+        """Continue behind the first *sent* frames; each frame that fails is skipped.
+
+        *number* is the errno of a call that sent none and returned -1.
+        """
+        key = tuple(frames)
+        _, headers = self._batches.get(key) or self._prepare(key)
         failed: list[OutFrame] = []
         done = 0
         tried_again = -1
         while True:
             # An ICMP error belongs to an earlier datagram: the call is made once more.
-            if sent < 0 and ctypes.get_errno() in ICMP_ERRNOS and tried_again != done:
+            if sent < 0 and number in ICMP_ERRNOS and tried_again != done:
                 tried_again, sent = done, 0
             elif sent < 0:
-                self._fail(frames[done], ctypes.get_errno())
+                self._fail(frames[done], number)
                 failed.append(frames[done])
                 sent = 1
             done += sent
             if done >= len(frames):
                 return failed
             sent = self._call(headers, done)()
+            number = ctypes.get_errno()
+
+    def fileno(self) -> int:
+        """Return the descriptor of the socket."""
+        return self._fd
+
+    def address_of(self, frame: OutFrame) -> bytes:
+        """Return the packed socket address of *frame*; nothing if the socket knows it."""
+        if self._address_of is None:
+            return b""
+        known = self._addresses.get(frame.destination) or self._resolve(frame.destination)
+        return bytes(known[0])
 
     def _fail(self, frame: OutFrame, number: int | None) -> None:
         frame.oversized = number == errno.EMSGSIZE

@@ -29,6 +29,7 @@ class TcpPort:
     """
 
     minimum_size = 0
+    direct = None
 
     def __init__(
         self,

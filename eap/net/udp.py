@@ -16,6 +16,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from eap.codec.ethercat import EAP_PORT
+from eap.compiled import override
 from eap.ids import Destination
 from eap.net.mmsg import BATCH, ReceiveBatch, SendBatch, note_receive_error
 from eap.pd.link import FrameHandler, OutFrame, exchange
@@ -40,20 +41,16 @@ class UdpChannel:
         sock.setblocking(False)
         self.handlers = list(handlers)
         self._sock = sock
-        self._fd = sock.fileno()
         self._batch = batch
         self._receive = batch.reader(sock.fileno())
-        self._compiled = batch.compiled()
-        self._sender = SendBatch(sock, _socket_address)
+        self.direct = SendBatch(sock, _socket_address)
         self.source_of = batch.source_reader()
-        self.errors = self._sender.errors
+        self.errors = self.direct.errors
+        override(self, "drain", batch.compiled_drain(sock.fileno(), self.handlers, self))
 
     def drain(self, now_ns: int) -> int:
         """Hand every waiting frame to the handlers, at most 256 in one call."""
         del now_ns  # the kernel's stamps are nearer to the wire
-        if self._compiled is not None:
-            count: int = self._compiled.drain(self._fd, self.handlers, None, self, self._note_error)
-            return count
         total = 0
         for _ in range(_BATCHES_PER_DRAIN):
             count = self._receive()
@@ -76,7 +73,8 @@ class UdpChannel:
                 break
         return total
 
-    def _note_error(self, number: int) -> bool:
+    def note_error(self, number: int) -> bool:
+        """Count why nothing was received; return whether messages may still be waiting."""
         return note_receive_error(self.errors, number)
 
     def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
@@ -90,7 +88,7 @@ class UdpChannel:
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Send *frames* to their destinations; return those that the kernel rejected."""
         del now_ns
-        return self._sender.send(frames)
+        return self.direct.send(frames)
 
     def link_header(self, destination: str) -> bytes:
         """Return nothing: the kernel writes the headers of a datagram to *destination*."""

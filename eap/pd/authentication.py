@@ -155,6 +155,8 @@ class SigningChannel(ChannelLayer):
     Behind whatever else writes into frames: a change after it would be a wrong tag.
     """
 
+    direct = None
+
     def __init__(self, channel: FrameChannel, keys: KeyRing) -> None:
         super().__init__(channel)
         self._keys = keys

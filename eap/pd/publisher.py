@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 from eap.ids import NetId
 from eap.pd.address import from_word, net_id_of, to_word
+from eap.pd.compiledplan import compile_groups
 from eap.pd.image import Image, Inputs
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FrameSlot, TxSlot
 from eap.pd.link import FrameChannel, OutFrame
@@ -65,14 +66,13 @@ def _enter_unsent(words: memoryview, frame: FrameSlot, state: FrameState, now_ns
     words[frame.words + FrameWord.UNSENT_AT_NS] = now_ns
 
 
-class _Group:
+class FrameGroup:
     """Frames that are sent whole, all in the same cycles: no decision is left but the cycle."""
 
-    __slots__ = ("counters", "frames", "out", "patches", "phase", "step")
+    __slots__ = ("counters", "frames", "out", "patches", "schedule")
 
     def __init__(self, schedule: Schedule, frames: list[TxFrame]) -> None:
-        self.step = schedule.step
-        self.phase = schedule.phase
+        self.schedule = schedule
         self.frames = frames
         self.out = [frame.whole.out for frame in frames]
         self.patches = [frame.whole.patch for frame in frames]
@@ -129,10 +129,10 @@ class Publisher:
             self.frames.append(frame)
             self._note_target(frame, net_id)
         self._controls: dict[str, int] = {}
-        self._groups: list[_Group] = []
-        self._always: _Group | None = None
-        """All frames, if all of them are sent in every cycle."""
-        self._due: list[_Group] = []
+        self.plan: object = None
+        """The groups for the compiled part; None if Python has to select frames."""
+        self._groups: list[FrameGroup] = []
+        self._due: list[FrameGroup] = []
         self._others: list[TxFrame] = []
         self._sending: list[tuple[TxFrame, Selection]] = []
         self.read_controls()
@@ -176,15 +176,9 @@ class Publisher:
         for frame in self.frames:
             if frame.is_plain and frame.schedule is not None:
                 plain.setdefault(frame.schedule, []).append(frame)
-        self._groups = [_Group(schedule, frames) for schedule, frames in plain.items()]
-        self._always = None
+        self._groups = [FrameGroup(schedule, frames) for schedule, frames in plain.items()]
         self._others = [frame for frame in self.frames if not frame.is_plain]
-        if not self._others and len(self._groups) == 1 and self._groups[0].step == 1:
-            self._always = self._groups[0]
-            self._due = self._groups
-            # sent() goes through `_due` and `_sending` in any case, so both have to fit the
-            # shortcut.
-            self._sending.clear()
+        self.plan = None if self._others else compile_groups(self._groups, self._words)
 
     def forget(self) -> None:
         """Reset the triggers: on-change PDs are due at once, and no event is pending.
@@ -225,20 +219,15 @@ class Publisher:
 
     def release(self) -> None:
         """Free all frames one by one: freeing many at once would delay the cycles."""
+        self.plan = None
         for container in (self._groups, self._due, self._others, self._sending):
             container.clear()
-        self._always = None
         while self.frames:
             self.frames.pop()
 
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
         """Return the frames due in this cycle, patched; :meth:`sent` must follow."""
-        # All frames are due in each cycle: neither a selection nor a new list is needed.
-        if (always := self._always) is not None:
-            for patch in always.patches:
-                patch(cycle)
-            return always.out
-        self._due = due = [group for group in self._groups if cycle % group.step == group.phase]
+        self._due = due = [group for group in self._groups if group.schedule.is_due(cycle)]
         for group in due:
             for patch in group.patches:
                 patch(cycle)
@@ -285,6 +274,12 @@ class Publisher:
             else:
                 words[first + FrameWord.PARTIAL] += 1
                 self._count(selection, now_ns)
+
+    def sent_partly(self, cycle: int, failed: Sequence[OutFrame], now_ns: int) -> None:
+        """Count the frames of :attr:`plan` that were due, all but *failed*."""
+        self._due = [group for group in self._groups if group.schedule.is_due(cycle)]
+        self._sending.clear()
+        self.sent(failed, now_ns)
 
     def _count(self, selection: Selection, now_ns: int) -> None:
         for pd in selection.pds:
@@ -353,6 +348,8 @@ class PollResponder:
         requests: Pending requests by sender.
         origins: Subscriptions from which its variables get their values.
     """
+
+    plan = None
 
     def __init__(
         self,

@@ -32,7 +32,7 @@ Origins: TypeAlias = Mapping[str, tuple[Origin, ...]]
 NO_ORIGINS: Origins = MappingProxyType({})
 
 _put_u16 = struct.Struct("<H").pack_into
-_QUALITY_SIZE = 2
+QUALITY_SIZE = 2
 """The quality is the last field of a PD header."""
 
 
@@ -86,6 +86,7 @@ class ForwardedQuality:
     """
 
     def __init__(self, image: Image, slots: Sequence[Origin]) -> None:
+        self.slots = slots
         self._ages = [
             partial(field_quality, image, slot)
             if isinstance(slot, FieldSlot)
@@ -97,7 +98,7 @@ class ForwardedQuality:
         """Write it to the header of the PD whose data starts at *offset* of *buffer*."""
         # A PD header has one quality for all values of the PD.
         oldest = max(age() for age in self._ages)
-        _put_u16(buffer, offset - _QUALITY_SIZE, oldest)
+        _put_u16(buffer, offset - QUALITY_SIZE, oldest)
 
 
 def forwarded_quality(

@@ -17,8 +17,10 @@ from typing import NamedTuple
 
 import msgspec
 
+from eap.compiled import override
 from eap.pd.address import NetIdLearner, forget
 from eap.pd.authentication import KeyRing, SigningChannel
+from eap.pd.compiledplan import compile_cycle
 from eap.pd.device import DeviceState, EapDevice
 from eap.pd.image import Image, Inputs, Sampler
 from eap.pd.link import CyclicBus, FrameChannel, FrameHandler, PortTap, StateChannel
@@ -28,7 +30,7 @@ from eap.pd.publisher import FrameRow, PollResponder, Publisher
 from eap.pd.quality import find_origins
 from eap.pd.spec import EngineSource, LengthCheck, PortKind, StationSpec, Writer
 from eap.pd.subscriber import NO_KEYS, Subscriber
-from eap.pd.words import BIN_OF_US, StationWord, histogram_bin
+from eap.pd.words import BIN_OF_US, WAKE_FOR_CYCLES, StationWord, histogram_bin
 
 _CYCLE = int(StationWord.CYCLE)
 _CYCLE_AT_NS = int(StationWord.CYCLE_AT_NS)
@@ -40,9 +42,6 @@ _OVERRUNS = int(StationWord.OVERRUNS)
 _LATENESS = int(StationWord.LATENESS)
 _BINS_KNOWN = len(BIN_OF_US)
 _LATENESS_MAX_NS = int(StationWord.LATENESS_MAX_NS)
-
-WAKE_FOR_CYCLES = 100
-"""Cycles after the last announcement of a waiting program in which waiters are woken."""
 
 _UNREAD_FOR_US = 10_000
 """Interval of draining a port without subscriptions, whose frames are only counted."""
@@ -92,12 +91,10 @@ class Station:
         self._run_links = Links(image, self.memory_of, spec.links).run if spec.links else None
         self._computes = bool(generated or spec.links)
         """True if variables are computed in the cycle."""
-        self._has_own_variables = self._computes
         self._origins = find_origins(image.layout, spec.links)
         self.buses: list[CyclicBus] = []
         self._publishers: list[tuple[Publisher | PollResponder, FrameChannel]] = []
-        self._sending: list[tuple[Publisher | PollResponder, FrameChannel]] = []
-        """The publishers, in states that send."""
+        self._sends = False
         self._senders: list[tuple[str, Publisher | PollResponder, FrameChannel]] = []
         """The publishers with their ports, and the channels without taps."""
         self._taps: dict[str, tuple[PortTap, FrameHandler]] = {}
@@ -131,6 +128,23 @@ class Station:
             name: subscriber.make_handler(self._learners.get(name))
             for name, subscriber in self._subscribers.items()
         }
+        # Its parts and not this object, which refers to it.
+        self._compiled = compile_cycle(
+            image.words,
+            self._rarely_every,
+            self._drains,
+            self._rarely,
+            self._supervisors,
+            self._closing,
+            self._publishers,
+            self._generate if self._computes else None,
+            self._run_links,
+            self._inputs.refresh,
+            partial(_read_controls, self._publishers),
+            self._samples.end_cycle,
+            wake,
+        )
+        override(self, "cycle", self._compiled)
 
     def _subscriber(self, port: str) -> Subscriber:
         rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
@@ -196,7 +210,7 @@ class Station:
 
     def _connect_senders(self) -> None:
         """Have the publishers send through their channels, or through the taps of their ports."""
-        # In place: the list of those that send is the same one, or empty.
+        # In place, as all lists of steps: the compiled cycle goes through the same ones.
         self._publishers[:] = [
             (publisher, self._taps[port][0].sending(channel) if port in self._taps else channel)
             for port, publisher, channel in self._senders
@@ -234,7 +248,6 @@ class Station:
         if channel not in self._channels:
             self._channels.append(channel)
             self._drains.append(channel.drain)
-            self._has_own_variables = True
 
     def connect_bus(self, bus: CyclicBus) -> None:
         """Exchange process data with *bus* in each cycle."""
@@ -242,7 +255,6 @@ class Station:
         self._drains.append(bus.receive)
         self._supervisors.append(partial(_supervise, bus))
         self._closing.append(bus.exchange)
-        self._has_own_variables = True
 
     def memory_of(self, writer: Writer) -> memoryview:
         """Return where the cycle reads the variables of *writer*, at their offsets in the image.
@@ -311,7 +323,9 @@ class Station:
     def _enter(self, state: DeviceState) -> None:
         self.device.go(state)
         self._words[StationWord.STATE] = state
-        self._sending = self._publishers if state.sends else []
+        self._sends = state.sends
+        if self._compiled is not None:
+            self._compiled.sends = state.sends
         if not state.receives:
             for requests in self._requests.values():
                 requests.pop_all()
@@ -361,7 +375,7 @@ class Station:
         self._inputs.reload()
         kept = self._subscribers.keys() - self._added
         replaced = [self._subscribers[port].handle_timeout for port in kept]
-        self._supervisors = [each for each in self._supervisors if each not in replaced]
+        self._supervisors[:] = [each for each in self._supervisors if each not in replaced]
         for port in kept:
             self._keep_subscriber(port, before, now_ns)
         self._taps = before._taps
@@ -406,14 +420,13 @@ class Station:
         cycle = words[_CYCLE] + 1
         words[_CYCLE] = cycle  # one by one: pack_into would show readers a 0 in between
         words[_CYCLE_AT_NS] = due_ns
-        if self._has_own_variables or not cycle % self._rarely_every:
+        if self._computes or self._drains or not cycle % self._rarely_every:
             changed = self._write_own_variables(cycle, now_ns)
         else:
             changed = self._inputs.refresh()
         if changed:
-            for publisher, _ in self._publishers:
-                publisher.read_controls()
-        for publisher, channel in self._sending:
+            _read_controls(self._publishers)
+        for publisher, channel in self._publishers if self._sends else ():
             frames = publisher.frames_to_send(cycle, now_ns)
             if frames:
                 publisher.sent(channel.send(frames, now_ns), now_ns)
@@ -455,6 +468,12 @@ class Station:
             changed = self._inputs.refresh()
         words[_SEQUENCE] = sequence + 2
         return changed
+
+
+def _read_controls(publishers: Iterable[tuple[Publisher | PollResponder, FrameChannel]]) -> None:
+    """Have publishers follow their control variables."""
+    for publisher, _ in publishers:
+        publisher.read_controls()
 
 
 def _learning_ports(spec: StationSpec) -> Iterator[str]:

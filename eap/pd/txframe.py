@@ -15,7 +15,7 @@ Rule 3: suppression beats every reason; a PD that was due counts as skipped, an 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple, TypeAlias
 
 from eap.codec import datatypes
@@ -23,6 +23,7 @@ from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PD_FRAME_START, PdFrameHeader, PdHeader
 from eap.ids import NetId
 from eap.pd.authentication import SIGNATURE_ID, SIGNATURE_SIZE, SIGNATURE_VERSION
+from eap.pd.compiledplan import compile_patch
 from eap.pd.image import Image, Inputs
 from eap.pd.layout import FrameSlot, TxSlot
 from eap.pd.link import FrameChannel, OutFrame
@@ -182,30 +183,31 @@ class Gather:
         plan = datatypes.layout(kinds)
         self.size = plan.size
         runs: list[Run] = []
-        self._bits: list[Run] = []
+        self.bits: list[Run] = []
+        self.image, self.inputs = image, inputs
         for slot, kind, target in zip(slots, kinds, plan.bit_offsets, strict=True):
             memory = image.memory if slot.writer is Writer.ENGINE else inputs.memory
             if kind.is_bits:
-                self._bits.append((memory, slot.bit_offset, target, kind.bit_length))
+                self.bits.append((memory, slot.bit_offset, target, kind.bit_length))
                 continue
             run = (memory, slot.bit_offset // 8, target // 8, kind.size)
             if runs and _continues(runs[-1], run):
                 _, source, first, size = runs.pop()
                 run = (memory, source, first, size + kind.size)
             runs.append(run)
-        self._runs = [
-            (target, target + size, memory[source : source + size])
-            for memory, source, target, size in runs
-        ]
+        self.runs = runs
 
     @property
     def has_bits(self) -> bool:
         """True if :meth:`bits_into` has anything to do."""
-        return bool(self._bits)
+        return bool(self.bits)
 
     def copies(self, offset: int) -> list[tuple[slice, memoryview]]:
         """Return the copies of whole bytes, by target slice, of a PD that starts at *offset*."""
-        return [(slice(offset + first, offset + last), data) for first, last, data in self._runs]
+        return [
+            (slice(offset + target, offset + target + size), memory[source : source + size])
+            for memory, source, target, size in self.runs
+        ]
 
     def into(self, buffer: memoryview, offset: int) -> None:
         """Write the PD's data as it is now to *buffer* at *offset*."""
@@ -217,7 +219,7 @@ class Gather:
         """Write the bits among the variables, packed."""
         # Put together first: several bit fields share a byte, which then is written once.
         octets: dict[int, int] = {}
-        for memory, source, target, length in self._bits:
+        for memory, source, target, length in self.bits:
             start, shift = divmod(source, 8)
             value = int.from_bytes(memory[start : start + 2], "little") >> shift
             first, shift = divmod(target, 8)
@@ -275,28 +277,37 @@ class TxPd:
 
 
 class Selection:
-    """A buffer for some of a frame's PDs, and where their data goes in it."""
+    """A buffer for some of a frame's PDs.
 
-    __slots__ = ("_copies", "_cycle_offset", "_others", "out", "pds")
+    Attributes:
+        patch: Writes the counter of a cycle and the current data of all PDs.
+    """
+
+    __slots__ = ("out", "patch", "pds")
 
     def __init__(self, out: OutFrame, pds: tuple[TxPd, ...]) -> None:
         self.out = out
         self.pds = pds
-        self._cycle_offset = out.headroom + CYCLE_OFFSET
         placed = list(zip(pds, _data_offsets(pds, out.headroom), strict=True))
-        # One flat list of all PDs' copies: a call for each PD would take longer than the copies.
-        self._copies = [copy for pd, offset in placed for copy in pd.gather.copies(offset)]
-        self._others = [(pd.gather.bits_into, at) for pd, at in placed if pd.gather.has_bits]
-        self._others += [(pd.quality.into, at) for pd, at in placed if pd.quality is not None]
+        self.patch: Callable[[int], None] = compile_patch(out, placed) or _patch(out, placed)
 
-    def patch(self, cycle: int) -> None:
-        """Write the counter and the current data of all PDs."""
-        view = self.out.view
-        _put_u16(view, self._cycle_offset, cycle & 0xFFFF)
-        for where, data in self._copies:
+
+def _patch(out: OutFrame, placed: Iterable[tuple[TxPd, int]]) -> Callable[[int], None]:
+    """Return the function that patches *out*, whose PDs have their data at the given offsets."""
+    view, cycle_offset = out.view, out.headroom + CYCLE_OFFSET
+    # One flat list of all PDs' copies: a call for each PD would take longer than the copies.
+    copies = [copy for pd, offset in placed for copy in pd.gather.copies(offset)]
+    others = [(pd.gather.bits_into, at) for pd, at in placed if pd.gather.has_bits]
+    others += [(pd.quality.into, at) for pd, at in placed if pd.quality is not None]
+
+    def patch(cycle: int) -> None:
+        _put_u16(view, cycle_offset, cycle & 0xFFFF)
+        for where, data in copies:
             view[where] = data
-        for write_into, offset in self._others:
+        for write_into, offset in others:
             write_into(view, offset)
+
+    return patch
 
 
 class TxFrame:

@@ -105,6 +105,10 @@ class StationWord(IntEnum):
     SIZE = LINKS_HELD + 3
 
 
+WAKE_FOR_CYCLES = 100
+"""Cycles after the last announcement of a waiting program in which waiters are woken."""
+
+
 class FrameWord(IntEnum):
     """The block of a TxFrame."""
 

@@ -162,6 +162,8 @@ class Wire:
         refuse: Whether the network refuses to send.
     """
 
+    direct = None
+
     def __init__(self, header: bytes = b"", minimum_size: int = 0) -> None:
         self.minimum_size = minimum_size
         self.sent: list[bytes] = []

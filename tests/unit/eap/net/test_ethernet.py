@@ -193,6 +193,18 @@ def test_ports_of_one_interface_hear_each_other(ends):
     assert far.drain(1) == [expect(1)]
 
 
+def test_port_sends_directly_unless_others_hear_its_frames_or_it_mends_them(ends):
+    near, far = Listener(ends[0]), Listener(ends[1])
+    assert near.port.direct is ends[0].sender
+    other = Listener(ends[0], vlan_id=10)
+    assert (near.port.direct, other.port.direct) == (None, None)
+    ends[0].remove(other.port)
+    assert near.port.direct is ends[0].sender
+    near.port.readdress()
+    assert near.port.direct is None
+    assert far.port.direct is ends[1].sender
+
+
 def test_exchanged_handler_takes_the_frames_of_the_other_and_none_of_its_own_port(ends):
     first, second = (Listener(ends[0]) for _ in range(2))
     far = Listener(ends[1])

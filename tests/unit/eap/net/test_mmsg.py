@@ -293,8 +293,22 @@ def _is_empty(sock):
 needs_compiled = pytest.mark.skipif(cyclic is None, reason="needs the compiled part: make setup")
 
 
+class Origin:
+    errors = 0
+
+    def note_error(self, number):
+        self.errors += 1
+        return False
+
+    def drain(self):
+        return 7
+
+
+ORIGIN = Origin()
+
+
 def drain(batch, sock, handler):
-    return batch.compiled().drain(sock.fileno(), [handler], None, "origin", lambda number: False)
+    return batch.compiled_drain(sock.fileno(), [handler], ORIGIN)(0)
 
 
 @needs_compiled
@@ -318,7 +332,7 @@ def test_compiled_receiver_hands_over_what_the_python_code_does(pair):
             # Two clocks are read one after the other: allow for a stall between the readings.
             assert all(before - 5_000_000 < each[1] <= after for each in got)
             host, port = sender.getsockname()
-            assert {each[2:] for each in got} == {((port, socket.inet_aton(host)), "origin")}
+            assert {each[2:] for each in got} == {((port, socket.inet_aton(host)), ORIGIN)}
             got.clear()
     assert drain(batch, receiver, handle) == 0
 
@@ -362,5 +376,24 @@ def test_compiled_receiver_refuses_memory_that_does_not_fit():
     ):
         with pytest.raises(ValueError, match="batch"):
             cyclic.Receiver(*parts[:index], wrong, *parts[index + 1 :])
-    with pytest.raises(TypeError):
-        batch.compiled().drain(0, {}, int, None, int)
+    for handlers in ({}, ()):
+        with pytest.raises(TypeError):
+            batch.compiled_drain(0, handlers, ORIGIN)
+
+
+@needs_compiled
+def test_compiled_drain_leaves_a_socket_to_its_origin_while_it_is_paused(pair):
+    drain = ReceiveBatch().compiled_drain(pair[1].fileno(), [], ORIGIN)
+    drain.is_paused = True
+    assert drain(0) == 7
+    drain.is_paused = False
+    assert drain(0) == 0
+
+
+@needs_compiled
+def test_compiled_drain_tells_its_origin_of_errors_and_ends_with_it():
+    origin = Origin()
+    drain = ReceiveBatch().compiled_drain(-1, [], origin)
+    assert (drain(0), origin.errors) == (0, 1)
+    del origin
+    assert drain(0) == 0

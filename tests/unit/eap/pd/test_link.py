@@ -28,6 +28,7 @@ class Wire:
     """Keeps what is sent, behind four octets of its own."""
 
     minimum_size = 60
+    direct = None
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []

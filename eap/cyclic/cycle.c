@@ -1,0 +1,216 @@
+/* The cycle of a station: Station.cycle(), which is the reference.
+
+   Its steps are objects of Python; those that are compiled run without a detour.  */
+
+#include "cyclic.h"
+
+/* Lists that the station changes between two cycles; then steps, of which the first two may be None. */
+enum { DRAINS, RARELY, SUPERVISORS, CLOSING, PUBLISHERS, GENERATE, RUN_LINKS, REFRESH,
+       READ_CONTROLS, SAMPLE, WAKE, PARTS };
+
+typedef struct {
+    PyObject_HEAD
+    Py_buffer buffer;
+    PyObject *parts[PARTS];
+    long long rarely_every;
+    int64_t settled[2];
+    char sends;
+} Cycle;
+
+static int cycle_clear(Cycle *self) {
+    for (int n = 0; n < PARTS; n++)
+        Py_CLEAR(self->parts[n]);
+    return 0;
+}
+
+static int cycle_traverse(Cycle *self, visitproc visit, void *arg) {
+    Py_VISIT(Py_TYPE((PyObject *)self));
+    for (int n = 0; n < PARTS; n++)
+        Py_VISIT(self->parts[n]);
+    return 0;
+}
+
+static void cycle_dealloc(Cycle *self) {
+    PyObject_GC_UnTrack(self);
+    cycle_clear(self);
+    release_buffer(&self->buffer);
+    free_object((PyObject *)self);
+}
+
+/* Cycle(words, rarely_every, parts): words of the image, and PARTS objects. */
+static PyObject *cycle_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
+    PyObject *words, *parts;
+    long long rarely_every;
+    if (!PyArg_ParseTuple(args, "OLO!", &words, &rarely_every, &PyTuple_Type, &parts))
+        return NULL;
+    Cycle *self = (Cycle *)make_object(type, keywords);
+    if (self == NULL)
+        return NULL;
+    int fits = PyTuple_Size(parts) == PARTS && rarely_every > 0;
+    for (int n = 0; fits && n < PARTS; n++) {
+        self->parts[n] = PyTuple_GetItem(parts, n);
+        Py_INCREF(self->parts[n]);
+        fits = n > PUBLISHERS || PyList_Check(self->parts[n]);
+    }
+    self->rarely_every = rarely_every;
+    self->settled[0] = self->settled[1] = -1;
+    if (!PyObject_GetBuffer(words, &self->buffer, PyBUF_CONTIG)) {
+        if (fits && self->buffer.len >= STATION_WORDS * WORD
+            && !((uintptr_t)self->buffer.buf % WORD))
+            return (PyObject *)self;
+        refuse("a cycle has the words of an image, lists and steps");
+    }
+    Py_DECREF(self);
+    return NULL;
+}
+
+/* Call a step; return whether its result is true, or -1. */
+static int call(PyObject *step, PyObject *argument) {
+    PyObject *result = PyObject_CallFunctionObjArgs(step, argument, NULL);
+    int is_true = result == NULL ? -1 : PyObject_IsTrue(result);
+    Py_XDECREF(result);
+    return is_true;
+}
+
+static int call_all(PyObject *steps, PyObject *now) {
+    int failed = 0;
+    for (Py_ssize_t n = 0; !failed && n < PyList_Size(steps); n++) {
+        PyObject *step = PyList_GetItem(steps, n);
+        Py_INCREF(step);
+        failed = (Py_IS_TYPE(step, drain_type) ? drain(step) : call(step, now)) < 0;
+        Py_DECREF(step);
+    }
+    return failed ? -1 : 0;
+}
+
+/* As Inputs.refresh(), which is called unless nothing was written since it has copied all. */
+static int refresh(Cycle *self) {
+    const int64_t *words = (int64_t *)self->buffer.buf + STATION_SERVICES;
+    int64_t before[] = {load(&words[0]), load(&words[1])};
+    if (before[0] == self->settled[0] && before[1] == self->settled[1])
+        return 0;
+    int changed = call(self->parts[REFRESH], NULL);
+    /* Odd while somebody writes; another value if that has begun meanwhile. */
+    if (!((before[0] | before[1]) & 1) && before[0] == load(&words[0])
+        && before[1] == load(&words[1]))
+        memcpy(self->settled, before, sizeof before);
+    return changed;
+}
+
+static int compute(Cycle *self, int64_t number) {
+    PyObject *links = self->parts[RUN_LINKS];
+    if (self->parts[GENERATE] == Py_None)
+        return refresh(self);
+    PyObject *count = PyLong_FromLongLong(number);
+    int changed = count == NULL || call(self->parts[GENERATE], count) < 0 ? -1 : refresh(self);
+    Py_XDECREF(count);
+    return changed < 0 || links == Py_None || call(links, NULL) >= 0 ? changed : -1;
+}
+
+/* As Station._write_own_variables(). */
+static int write_own_variables(Cycle *self, int64_t cycle, int is_rare, PyObject *now) {
+    int64_t *words = self->buffer.buf, sequence = load(&words[STATION_SEQUENCE]);
+    store(&words[STATION_SEQUENCE], sequence + 1);
+    __atomic_thread_fence(__ATOMIC_RELEASE);
+    if (call_all(self->parts[DRAINS], now) || (is_rare && call_all(self->parts[RARELY], now))
+        || call_all(self->parts[SUPERVISORS], now))
+        return -1;
+    int changed = compute(self, cycle + load(&words[STATION_OVERRUNS]));
+    if (changed >= 0)
+        __atomic_store_n(&words[STATION_SEQUENCE], sequence + 2, __ATOMIC_RELEASE);
+    return changed;
+}
+
+/* Send the frames of one publisher that are due. */
+static int send_frames(PyObject *publisher, PyObject *channel, int64_t cycle, PyObject *now) {
+    PyObject *plan = PyObject_GetAttr(publisher, text_plan), *frames = NULL, *failed = NULL;
+    int result = -1;
+    if (plan != NULL && Py_IS_TYPE(plan, send_plan_type))
+        result = send_due(plan, publisher, channel, now);
+    else if (plan != NULL
+             && (frames = PyObject_CallMethod(publisher, "frames_to_send", "LO", (long long)cycle,
+                                              now)) != NULL
+             && (result = PyObject_IsTrue(frames)) > 0) {
+        failed = PyObject_CallMethodObjArgs(channel, text_send, frames, now, NULL);
+        PyObject *done = failed == NULL ? NULL
+                         : PyObject_CallMethod(publisher, "sent", "OO", failed, now);
+        result = done == NULL ? -1 : 0;
+        Py_XDECREF(done);
+    }
+    Py_XDECREF(failed);
+    Py_XDECREF(frames);
+    Py_XDECREF(plan);
+    return result;
+}
+
+static int send_all(Cycle *self, int64_t cycle, PyObject *now) {
+    PyObject *publishers = self->parts[PUBLISHERS];
+    int failed = 0;
+    for (Py_ssize_t n = 0; !failed && n < PyList_Size(publishers); n++) {
+        PyObject *pair = PyList_GetItem(publishers, n);
+        PyObject *publisher = PyTuple_GetItem(pair, 0), *channel = PyTuple_GetItem(pair, 1);
+        if (publisher == NULL || channel == NULL)
+            return -1;
+        Py_INCREF(pair);
+        failed = send_frames(publisher, channel, cycle, now);
+        Py_DECREF(pair);
+    }
+    return failed ? -1 : 0;
+}
+
+static int end_cycle(Cycle *self, int64_t cycle, int64_t late_ns, PyObject *now) {
+    int64_t *words = self->buffer.buf;
+    add(&words[STATION_LATENESS + bin_of(late_ns / 1000)], 1);
+    if (late_ns > load(&words[STATION_LATENESS_MAX_NS]))
+        store(&words[STATION_LATENESS_MAX_NS], late_ns);
+    if (cycle <= load(&words[STATION_SAMPLED_UNTIL])) {
+        PyObject *done = PyObject_CallFunction(self->parts[SAMPLE], "LO", (long long)cycle, now);
+        Py_XDECREF(done);
+        if (done == NULL)
+            return -1;
+    }
+    /* All of the cycle first: snapshots are taken while this word agrees with the counter. */
+    __atomic_store_n(&words[STATION_FUTEX], cycle & 0xFFFFFFFF, __ATOMIC_RELEASE);
+    if (cycle - load(&words[STATION_WAITERS]) <= WAKE_FOR_CYCLES)
+        return call(self->parts[WAKE], NULL) < 0 ? -1 : 0;
+    return 0;
+}
+
+/* cycle(due_ns, now_ns) */
+static PyObject *cycle_call(Cycle *self, PyObject *args, PyObject *keywords) {
+    long long due_ns;
+    PyObject *now;
+    (void)keywords;
+    if (!PyArg_ParseTuple(args, "LO", &due_ns, &now))
+        return NULL;
+    int64_t *words = self->buffer.buf, now_ns = PyLong_AsLongLong(now);
+    if (now_ns == -1 && PyErr_Occurred())
+        return NULL;
+    const int64_t cycle = load(&words[STATION_CYCLE]) + 1;
+    store(&words[STATION_CYCLE], cycle);
+    store(&words[STATION_CYCLE_AT_NS], due_ns);
+    __atomic_thread_fence(__ATOMIC_RELEASE);
+    int is_rare = !(cycle % self->rarely_every);
+    int has_own = self->parts[GENERATE] != Py_None || PyList_Size(self->parts[DRAINS]) > 0;
+    int changed = has_own || is_rare ? write_own_variables(self, cycle, is_rare, now)
+                                     : refresh(self);
+    if (changed < 0 || (changed && call(self->parts[READ_CONTROLS], NULL) < 0)
+        || (self->sends && send_all(self, cycle, now)) || call_all(self->parts[CLOSING], now)
+        || end_cycle(self, cycle, now_ns - due_ns, now))
+        return NULL;
+    Py_RETURN_NONE;
+}
+
+static PyMemberDef cycle_members[] = {
+    {"sends", T_BOOL, offsetof(Cycle, sends), 0, NULL},
+    {NULL, 0, 0, 0, NULL},
+};
+static PyType_Slot cycle_slots[] = {
+    {Py_tp_new, cycle_new}, {Py_tp_dealloc, cycle_dealloc}, {Py_tp_call, cycle_call},
+    {Py_tp_traverse, cycle_traverse}, {Py_tp_clear, cycle_clear}, {Py_tp_members, cycle_members},
+    {0, NULL},
+};
+PyType_Spec cycle_spec = {
+    "eap._cyclic.Cycle", sizeof(Cycle), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_IMMUTABLETYPE, cycle_slots,
+};

@@ -1,0 +1,581 @@
+"""The compiled cycle of a station beside the Python code, which is the reference."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import socket
+import struct
+import sys
+import weakref
+from collections.abc import Iterator, Sequence
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from eap.compiled import cyclic
+from eap.errors import LocalProtocolError
+from eap.ids import NetId
+from eap.net.mmsg import SendBatch
+from eap.pd import compiledplan
+from eap.pd.authentication import KeyRing, Keys
+from eap.pd.device import DeviceState
+from eap.pd.handover import ImageHandover
+from eap.pd.link import FrameHandler, OutFrame
+from eap.pd.publisher import Publisher
+from eap.pd.spec import (
+    REQUESTER,
+    CounterSource,
+    LinkSpec,
+    OnChangeSpec,
+    RxPdSpec,
+    S7Source,
+    StationSpec,
+    Substitute,
+    TriggerSpec,
+    TxFrameSpec,
+    TxPdSpec,
+    VariableSpec,
+    Writer,
+)
+from eap.pd.station import Station
+from eap.pd.words import StationWord
+from tests.support.cyclic import (
+    MS,
+    PEER,
+    eap_port,
+    give,
+    image_of,
+    octets,
+    received,
+    station,
+    written,
+)
+
+pytestmark = [
+    pytest.mark.net,
+    pytest.mark.skipif(cyclic is None, reason="needs the compiled part: make setup"),
+]
+
+THERE, UNREACHABLE, NOWHERE = "10.0.0.1", "240.0.0.1", "10.0.0.1:0"
+"""Destinations: the receiver of a test, ENETUNREACH, EINVAL."""
+NET_ID = "5.23.91.23.1.1"
+KEYS = Keys({1: b"0123456789abcdef"}, 1)
+
+
+@contextlib.contextmanager
+def python_alone() -> Iterator[None]:
+    """Have everything that is built meanwhile do without the compiled part."""
+    compiled, compiledplan._cyclic = compiledplan._cyclic, None
+    try:
+        yield
+    finally:
+        compiledplan._cyclic = compiled
+
+
+def pd(name: str, number: int, *variables: str, **trigger: object) -> TxPdSpec:
+    return TxPdSpec(name, number, variables, trigger=TriggerSpec(**trigger))
+
+
+SCHEDULED = (
+    TxFrameSpec("f", "eap0", THERE, (pd("p", 1, "x", "flag"), pd("q", 2, "y"))),
+    TxFrameSpec("g", "eap0", THERE, (pd("r", 3, "bit", "x", "two"),), divider=2, modulo=1),
+    TxFrameSpec("h", "eap0", THERE, (pd("s", 4, "a", "x", cycle_us=3000), )),
+    TxFrameSpec("i", "eap0", THERE, (pd("t", 5, "copy", "b"), pd("u", 6, "field", "count"))),
+)  # fmt: skip
+OTHERS = {
+    "change": TxFrameSpec("c", "eap0", THERE, (pd("v", 7, "x", on_change=OnChangeSpec(20, 100)),)),
+    "event": TxFrameSpec("e", "eap0", THERE, (pd("w", 8, "y", event=True), pd("w2", 9, "x"))),
+    "unreachable": TxFrameSpec("n", "eap0", UNREACHABLE, (pd("n1", 10, "x"),)),
+    "refused": TxFrameSpec("o", "eap0", NOWHERE, (pd("o1", 11, "y"),)),
+    "poll": TxFrameSpec("l", "eap0", REQUESTER, (TxPdSpec("l1", 12, ("x",), poll_request="ask"),)),
+    "signed": TxFrameSpec("d", "eap0", THERE, (pd("d1", 13, "y"),), sign=True),
+}
+VARIABLES = (
+    *written("x:UINT", "y:UDINT", "flag:BOOL", "bit:BIT2", "two:BIT8"),
+    *received("a:UINT", "b:BOOL", "copy:UINT", "ask.x:UINT", "count:UINT"),
+    VariableSpec("field", "UINT", Writer.SERVICES),
+)
+
+
+def spec_of(*others: str, frames: Sequence[TxFrameSpec] = SCHEDULED, eap_sm: bool = False):
+    port = eap_port()
+    if eap_sm:
+        port = type(port)(port.name, port.kind, port.interface, port.net_id, eap_sm=True)
+    return station(
+        ports=(port,),
+        variables=VARIABLES,
+        links=(LinkSpec("a", "copy"),),
+        sources=(
+            S7Source("field", "press", "DB1.DBW0", timeout_ms=50, substitute=Substitute.HOLD),
+            CounterSource("count", 3),
+        ),
+        subscriptions=(
+            RxPdSpec("a", "eap0", 1, ("a",), PEER, sender_cycle_us=1000, step=1, timeout_ms=4),
+            RxPdSpec("b", "eap0", 2, ("b",), PEER, sender_cycle_us=1000, step=1),
+            RxPdSpec("ask", "eap0", 3, ("ask.x",), PEER),
+        ),
+        frames=(*frames, *(OTHERS[each] for each in others)),
+    )
+
+
+class Line:
+    """A channel whose frames go to a socket; what arrived there is read back."""
+
+    minimum_size = 0
+
+    def __init__(self) -> None:
+        self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._far.bind(("127.0.3.11", 0))
+        self._far.setblocking(False)
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.setblocking(False)
+        self.sender = SendBatch(self._sock, self._address)
+        self.direct: SendBatch | None = self.sender
+        self.waiting: list[tuple[bytes, int]] = []
+        self.handlers: list[FrameHandler] = []
+        self.calls: list[int] = []
+
+    def _address(self, destination: str) -> tuple[bytes, tuple[str, int]]:
+        host, port = self._far.getsockname()
+        if destination == UNREACHABLE:
+            host = UNREACHABLE
+        if destination == NOWHERE:
+            port = 0
+        packed = struct.pack("@H", socket.AF_INET) + struct.pack("!H", port)
+        return packed + socket.inet_aton(host) + bytes(8), (host, port)
+
+    def drain(self, now_ns: int) -> int:
+        self.calls.append(now_ns)
+        frames, self.waiting = self.waiting, []
+        for frame, at_ns in frames:
+            for handler in self.handlers:
+                give(handler, frame, at_ns)
+        return len(frames)
+
+    def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
+        self.calls.append(-now_ns)
+        return self.sender.send(frames)
+
+    def link_header(self, destination: str) -> bytes:
+        del destination
+        return b""
+
+    def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
+        self.handlers[:] = [new if each is old else each for each in self.handlers]
+
+    def arrived(self) -> list[bytes]:
+        frames = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                frames.append(self._far.recv(4096))
+        return frames
+
+    def close(self) -> None:
+        self._far.close()
+        self._sock.close()
+
+
+class Side:
+    """A station that runs by the compiled part or without it."""
+
+    def __init__(self, spec: StationSpec, *, compiled: bool) -> None:
+        self.compiled = compiled
+        self.line = Line()
+        self.wakes = 0
+        self.keys = KeyRing(KEYS)
+        self.station = self._make(spec)
+        with self.mode():
+            self.station.connect("eap0", self.line)
+        self.line.handlers.append(self.station.handlers["eap0"])
+        self.station.start(1000 * MS)
+
+    def mode(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext() if self.compiled else python_alone()
+
+    def _make(self, spec: StationSpec) -> Station:
+        self.image = image_of(spec)
+        with self.mode():
+            made = Station(spec, self.image, self._wake, self.keys)
+        assert ("cycle" in vars(made)) == self.compiled
+        return made
+
+    def _wake(self) -> None:
+        self.wakes += 1
+
+    def replace(self, spec: StationSpec, now_ns: int) -> None:
+        before, image = self.station, self.image
+        after = self._make(spec)
+        handover = ImageHandover(image, self.image)
+        handover.carry_words()
+        handover.carry_values(before.inputs.memory)
+        with self.mode():
+            after.prepare_handover(before)
+            after.follow(before, now_ns)
+            before.release()
+        self.station = after
+
+    @property
+    def publisher(self) -> Publisher | None:
+        return self.station._ports["eap0"].publisher
+
+
+class Twins:
+    """The same station twice; both get the same."""
+
+    def __init__(self, spec: StationSpec) -> None:
+        self.sides = [Side(spec, compiled=each) for each in (True, False)]
+        self.now_ns = 1000 * MS
+        self.number = 0
+
+    def cycle(self, late_ns: int = 0) -> list[bytes]:
+        self.now_ns += MS
+        for side in self.sides:
+            with side.mode():
+                side.station.cycle(self.now_ns - late_ns, self.now_ns)
+        return self.compare()
+
+    def compare(self) -> list[bytes]:
+        one, other = self.sides
+        sent, expected = one.line.arrived(), other.line.arrived()
+        assert [each.hex(" ") for each in sent] == [each.hex(" ") for each in expected]
+        words = list(zip(one.image.words, other.image.words, strict=True))
+        assert {n: pair for n, pair in enumerate(words) if pair[0] != pair[1]} == {}
+        assert bytes(one.image.memory) == bytes(other.image.memory)
+        assert one.line.sender.errors == other.line.sender.errors
+        assert one.wakes == other.wakes
+        return sent
+
+    def each(self, do: object, *args: object) -> None:
+        for side in self.sides:
+            with side.mode():
+                do(side, *args)
+
+    def close(self) -> None:
+        for side in self.sides:
+            side.line.close()
+
+
+@contextlib.contextmanager
+def twins(spec: StationSpec) -> Iterator[Twins]:
+    made = Twins(spec)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def put(side: Side, name: str, value: object) -> None:
+    with side.image.writing(Writer.APPLICATION):
+        side.image.write(name, value)
+
+
+def arrive(side: Side, frame: bytes, at_ns: int) -> None:
+    side.line.waiting.append((frame, at_ns))
+
+
+def add(side: Side, word: StationWord, more: int) -> None:
+    side.image.words[word] += more
+
+
+def fill_field(side: Side, at_ns: int) -> None:
+    side.image.words[side.image.layout.fields[0].words] = at_ns
+
+
+def is_direct(side: Side, yes: bool) -> None:
+    side.line.direct = side.line.sender if yes else None
+
+
+STATES = (DeviceState.SAFEOP, DeviceState.PREOP, DeviceState.OP)
+value = st.integers(0, 3)
+steps = st.one_of(
+    st.tuples(st.just("cycle"), st.sampled_from((0, 0, 900, 2_500_000, -7_000, 300_000_000))),
+    st.tuples(st.just("put"), st.sampled_from(("x", "y", "flag", "bit", "two")), value),
+    st.tuples(
+        st.just("put"),
+        st.sampled_from(("f.FrameCtrl", "g.FrameCtrl", "p.VarCtrl", "q.VarCtrl", "w.VarCtrl")),
+        value,
+    ),
+    st.tuples(st.just("arrive"), st.sampled_from(((1,), (2,), (1, 2), (3,))), value),
+    st.tuples(st.just("word"), st.sampled_from((
+        StationWord.OVERRUNS, StationWord.SAMPLED_UNTIL, StationWord.WAITERS,
+        StationWord.APPLICATION_SEQUENCE, StationWord.SERVICES_SEQUENCE,
+    )), st.sampled_from((1, 2, 1000))),
+    st.tuples(st.just("field"), st.sampled_from((0, 30 * MS, -MS))),
+    st.tuples(st.just("direct"), st.booleans()),
+    st.tuples(st.just("go"), st.sampled_from(STATES)),
+    st.tuples(st.just("replace"), st.sampled_from(((), ("change",), ("unreachable", "refused")))),
+)  # fmt: skip
+
+
+class Run:
+    """The steps of one example."""
+
+    def __init__(self, made: Twins) -> None:
+        self.twins = made
+        self.frames = 0
+
+    def take(self, step: tuple) -> None:
+        what, *args = step
+        getattr(self, what)(*args)
+
+    def cycle(self, late_ns: int) -> None:
+        self.twins.cycle(late_ns)
+
+    def put(self, name: str, number: int) -> None:
+        if name in self.twins.sides[0].image.slots:
+            self.twins.each(put, name, bool(number & 1) if name == "flag" else number)
+
+    def arrive(self, ids: tuple[int, ...], number: int) -> None:
+        self.frames += 1
+        data = {1: bytes((1, number)), 2: bytes((number & 1,)), 3: b"\0\0"}
+        frame = octets([(n, data[n], 0, number) for n in ids], cycle=self.frames)
+        self.twins.each(arrive, frame, self.twins.now_ns + MS)
+
+    def word(self, word: StationWord, more: int) -> None:
+        self.twins.each(add, word, more)
+
+    def field(self, ago_ns: int) -> None:
+        self.twins.each(fill_field, self.twins.now_ns - ago_ns)
+
+    def direct(self, yes: bool) -> None:
+        self.twins.each(is_direct, yes)
+
+    def go(self, state: DeviceState) -> None:
+        for side in self.twins.sides:
+            with side.mode(), contextlib.suppress(LocalProtocolError):
+                side.station.go(state, self.twins.now_ns)
+
+    def replace(self, others: tuple[str, ...]) -> None:
+        for side in self.twins.sides:
+            side.replace(spec_of(*others), self.twins.now_ns)
+
+
+@given(
+    others=st.sets(st.sampled_from(tuple(OTHERS))),
+    eap_sm=st.booleans(),
+    steps=st.lists(steps | st.just(("cycle", 0)), min_size=5, max_size=60),
+)
+@settings(max_examples=150)
+def test_station_does_the_same_with_and_without_the_compiled_part(others, eap_sm, steps):
+    with twins(spec_of(*sorted(others), eap_sm=eap_sm)) as made:
+        run = Run(made)
+        for step in steps:
+            run.take(step)
+            made.compare()
+
+
+def usual(*frames: TxFrameSpec) -> StationSpec:
+    return station(variables=VARIABLES, frames=frames or SCHEDULED[:2])
+
+
+class CountCalls:
+    """Counts the calls of functions in Python while it is entered."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def _note(self, frame, event, argument) -> None:
+        del argument
+        if event == "call":
+            self.calls.append(frame.f_code.co_qualname)
+
+    def __enter__(self) -> list[str]:
+        sys.setprofile(self._note)
+        return self.calls
+
+    def __exit__(self, *_: object) -> None:
+        sys.setprofile(None)
+
+
+def test_frames_that_go_by_their_schedule_run_no_python():
+    with twins(usual()) as made:
+        made.cycle()
+        side = made.sides[0]
+        side.station._rarely.clear()
+        side.image.words[StationWord.WAITERS] = -1000
+        with CountCalls() as calls:
+            for now_ns in range(2000 * MS, 2010 * MS, MS):
+                side.station.cycle(now_ns, now_ns)
+        assert calls == ["CountCalls.__exit__"]
+        assert len(side.line.arrived()) == 15
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("wrong", [UNREACHABLE, NOWHERE])
+def test_frames_behind_one_that_the_kernel_refuses_are_sent(count, wrong):
+    frames = [
+        TxFrameSpec(f"f{n}", "eap0", wrong if n == count // 2 else THERE, (pd(f"p{n}", n, "x"),))
+        for n in range(count)
+    ]
+    with twins(usual(*frames)) as made:
+        for _ in range(3):
+            assert len(made.cycle()) == count - 1
+        (name,) = made.sides[0].line.sender.errors.items()
+        assert name == ("ENETUNREACH" if wrong is UNREACHABLE else "EINVAL", 3)
+
+
+def test_frames_for_which_there_is_no_room_count_as_skipped():
+    with twins(usual()) as made:
+        for side in made.sides:
+            pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+            for each in pair:
+                each.setblocking(False)
+            side.line.sender = side.line.direct = SendBatch(pair[0])
+            side.line.pair = pair
+        for _ in range(1000):
+            made.cycle()
+        assert made.sides[0].line.sender.errors["EAGAIN"] > 100
+        for side in made.sides:
+            for each in side.line.pair:
+                each.close()
+        made.cycle()
+        assert made.sides[0].line.sender.errors["EBADF"]
+
+
+def learn(side: Side, destination: str) -> None:
+    side.publisher.learn(NetId.parse(PEER), destination)
+
+
+def test_plan_follows_another_socket_and_another_destination():
+    frame = TxFrameSpec("f", "eap0", NET_ID, (pd("p", 1, "x"),), mac="")
+    with twins(usual(frame)) as made:
+        assert made.cycle() == []
+        for destination in (THERE, UNREACHABLE, THERE):
+            made.each(learn, destination)
+            assert len(made.cycle()) == (destination == THERE)
+        for side in made.sides:
+            side.line.close()
+            side.line, old = Line(), side.line
+            old.sender = old.direct = side.line.sender
+        assert len(made.cycle()) == 1
+
+
+def test_plan_that_does_not_fit_is_refused():
+    frame, words = bytearray(20), memoryview(bytearray(8 * 512)).cast("q")
+    memories = memoryview(bytearray(64)), memoryview(bytearray(32))
+
+    def moves(*numbers: int) -> bytes:
+        return struct.pack("=4q", *numbers)
+
+    def origin(*numbers: int) -> bytes:
+        return struct.pack("=3q", *numbers)
+
+    good = [frame, 10, memories, words, MS, moves(1, 0, 96, 64), origin(16, 100, 56)]
+    patch = cyclic.Patch(*good)
+    for index, wrong in (
+        (0, bytearray(11)),
+        (1, 19),
+        (1, -1),
+        (3, words[:50]),
+        (4, 0),
+        (4, 1 << 62),
+        (5, b"abc"),
+        (5, moves(2, 0, 96, 64)),
+        (5, moves(-1, 0, 96, 64)),
+        (5, moves(1, 8 * 32, 96, 8)),
+        (5, moves(1, 8 * 31, 96, 16)),
+        (5, moves(1, -8, 96, 8)),
+        (5, moves(1, 0, 8 * 20, 8)),
+        (5, moves(1, 0, 8 * 20 - 1, 2)),
+        (5, moves(1, 0, -8, 8)),
+        (5, moves(1, 0, 96, -8)),
+        (5, moves(1, 0, 96, 1 << 62)),
+        (5, moves(1, 1, 96, 9)),
+        (6, b"abc"),
+        (6, origin(19, 100, 56)),
+        (6, origin(-1, 100, 56)),
+        (6, origin(16, 100, 57)),
+        (6, origin(16, -1, 56)),
+        (6, origin(16, 500, 56)),
+        (6, origin(16, 512, -1)),
+    ):
+        with pytest.raises(ValueError, match="patch"):
+            cyclic.Patch(*good[:index], wrong, *good[index + 1 :])
+    with pytest.raises(BufferError):
+        cyclic.Patch(bytes(20), *good[1:])
+    row = struct.pack("=4q", 1, 0, 200, 201)
+    cyclic.SendPlan((frame,), (patch,), row, words)
+    for wrong in (
+        ((frame,), (), row, words),
+        ((), (), row, words),
+        ((frame,), (print,), row, words),
+        ((frame,), (patch,), row[:-8], words),
+        ((frame,), (patch,), struct.pack("=4q", 0, 0, 200, 201), words),
+        ((frame,), (patch,), struct.pack("=4q", 1, 0, 512, 201), words),
+        ((frame,), (patch,), struct.pack("=4q", 1, 0, 200, -1), words),
+        ((frame,), (patch,), row, words[:50]),
+    ):
+        with pytest.raises(ValueError, match="plan"):
+            cyclic.SendPlan(*wrong)
+    parts = [[], [], [], [], [], None, None, print, print, print, print]
+    cyclic.Cycle(words, 10, tuple(parts))
+    for wrong in (
+        (words[:50], 10, tuple(parts)),
+        (words, 0, tuple(parts)),
+        (words, 10, tuple(parts[:-1])),
+        (words, 10, (None, *parts[1:])),
+    ):
+        with pytest.raises(ValueError, match="cycle"):
+            cyclic.Cycle(*wrong)
+
+
+def test_quality_of_words_that_are_no_index_is_the_largest():
+    words = memoryview(bytearray(8 * 512)).cast("q")
+    memory, frame = memoryview(bytearray(64)), bytearray(20)
+    patch = cyclic.Patch(
+        frame, 10, (memory, memory), words, MS, b"", struct.pack("=3q", 16, 200, 0)
+    )
+    for tracker in (-5, 511, 1 << 40, 200):
+        words[200] = tracker
+        patch(1)
+        assert frame[16:18] == b"\xff\xff"
+
+
+def test_errors_of_steps_are_raised():
+    words = memoryview(bytearray(8 * 512)).cast("q")
+
+    def fail(*_: object) -> None:
+        raise KeyError("step")
+
+    def no(*_: object) -> bool:
+        return False
+
+    for place in range(11):
+        parts: list = [[], [], [], [], [], no, no, no, no, no, no]
+        parts[place] = [fail] if place < 4 else [(1, 2)] if place == 4 else fail
+        if place == 8:
+            parts[7] = lambda: True
+        cycle = cyclic.Cycle(words, 1, tuple(parts))
+        cycle.sends = True
+        words[StationWord.SAMPLED_UNTIL] = words[StationWord.CYCLE] + 1
+        with pytest.raises((KeyError, AttributeError)):
+            cycle(1, 1)
+    for wrong in ((), (1,), ("a", 1), (1, "a"), (1 << 70, 1), (1, 1 << 70)):
+        with pytest.raises((TypeError, OverflowError)):
+            cycle(*wrong)
+
+
+def test_station_is_freed_without_the_collector():
+    with twins(usual()) as made:
+        made.cycle()
+        side = made.sides[0]
+        gone = [weakref.ref(side.station), weakref.ref(side.publisher)]
+        gc.disable()
+        try:
+            del side.station
+            assert [each() for each in gone] == [None, None]
+        finally:
+            gc.enable()
+
+
+def test_cycle_in_a_cycle_is_collected():
+    with twins(usual()) as made:
+        made.cycle()
+        side = made.sides[0]
+        side.station._closing.append(lambda now_ns, station=side.station: None)
+        gone = weakref.ref(side.station)
+        del side.station
+        gc.collect()
+        assert gone() is None
