@@ -5,7 +5,7 @@
 #include <stdlib.h>
 
 /* Parameters, plans and offsets as eap/compiled.py gives them; raised when either side changes. */
-#define API 3
+#define API 4
 
 PyTypeObject *plan_type, *handler_type, *receiver_type, *drain_type, *patch_type, *send_plan_type;
 static PyTypeObject *cycle_type;
@@ -35,7 +35,7 @@ static const struct {
 static const int offsets[] = {
     STATION_CYCLE, STATION_CYCLE_AT_NS, STATION_FUTEX, STATION_WAITERS, STATION_SEQUENCE,
     STATION_SERVICES, STATION_APPLICATION, STATION_OVERRUNS, STATION_LATENESS_MAX_NS,
-    STATION_LATENESS, STATION_SAMPLED_UNTIL, STATION_WORDS, RX_TRACKER, RX_RESPONSE_NS, RX_RECEIVED,
+    STATION_LATENESS, STATION_SAMPLED_UNTIL, RX_TRACKER, RX_RESPONSE_NS, RX_RECEIVED,
     RX_WORDS, DUPLICATED, LATE, STATE, LAST_CYCLE, ARRIVED_AT_NS, ARRIVED_IN_CYCLE, BEHIND,
     JITTER_MAX_US, JITTER, TRACKER_WORDS, CYCLE_AT, FIRST_PD, QUALITY_MAX, QUALITY_NS,
     WAKE_FOR_CYCLES,

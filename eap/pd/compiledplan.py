@@ -39,7 +39,6 @@ _STATION_WORDS = (
     StationWord.LATENESS_MAX_NS,
     StationWord.LATENESS,
     StationWord.SAMPLED_UNTIL,
-    StationWord.SIZE,
 )
 _RX_WORDS = (RxWord.TRACKER, RxWord.RESPONSE_NS, RxWord.RECEIVED, RxWord.SIZE)
 _TRACKER_WORDS = (

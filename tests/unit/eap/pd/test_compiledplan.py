@@ -378,6 +378,10 @@ def test_alternate_layouts_are_the_same_with_and_without_the_compiled_part():
     assert twin.compiled.word("a", RxWord.RECEIVED) == 19
 
 
+def test_compiled_part_that_was_built_is_used():
+    assert compiledplan._cyclic is cyclic, "an offset or a number of eap/cyclic differs from Python"
+
+
 def test_offsets_of_another_image_layout_switch_the_compiled_part_off(monkeypatch):
     monkeypatch.setattr(compiledplan, "_cyclic", None)
     r = usual()
