@@ -30,8 +30,8 @@ from tools.bench.settings import Settings, quick
 
 NAMES = (
     "throughput", "latency", "onestation", "poll", "lateness", "solar", "limits", "demo",
-    "bus", "recording", "web", "mqtt", "opcua", "receive", "objects", "change", "routing", "ads",
-    "gateway", "files", "startup", "acyclic", "cycle", "plantbus", "recovery", "segment",
+    "bus", "recording", "web", "mqtt", "opcua", "requests", "receive", "objects", "change",
+    "routing", "ads", "gateway", "files", "startup", "acyclic", "cycle", "plantbus", "recovery", "segment",
 )  # fmt: skip
 PAGE = ROOT / "docs" / "performance.md"
 TARGETS = "Targets, and what limits them"
