@@ -10,12 +10,15 @@ import argparse
 import importlib
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import msgspec
 
 from tools.bench import machine
+from tools.bench.charts import Chart, write_charts
 from tools.bench.figures import (
     Decision,
     Figure,
@@ -31,24 +34,55 @@ from tools.bench.settings import Settings, quick
 NAMES = (
     "throughput", "latency", "onestation", "poll", "lateness", "solar", "limits", "demo",
     "bus", "recording", "web", "mqtt", "opcua", "requests", "receive", "objects", "change",
-    "routing", "ads", "gateway", "files", "startup", "acyclic", "cycle", "plantbus", "recovery", "segment",
+    "routing", "ads", "gateway", "files", "startup", "acyclic", "cycle", "plantbus", "recovery",
+    "segment",
 )  # fmt: skip
 PAGE = ROOT / "docs" / "performance.md"
+PICTURES = PAGE.parent / "pictures"
 TARGETS = "Targets, and what limits them"
 BEGIN, END = "<!-- bench begin -->", "<!-- bench end -->"
 
 
 class Section(msgspec.Struct, frozen=True):
-    """Result of one benchmark."""
+    """Result of one benchmark, and how long it took."""
 
     name: str
     title: str
     figures: list[Figure]
+    seconds: float = 0.0
+
+
+class Report(msgspec.Struct, frozen=True):
+    """Results of one run, as ``--json`` writes them."""
+
+    machine: str
+    quick: bool
+    targets: list[Figure]
+    """Figures of all sections that have a limit."""
+    sections: list[Section]
 
 
 def main(arguments: list[str]) -> int:
     """Run the selected benchmarks; return 0 even when a target was missed."""
     options = _parse(arguments)
+    if options.read:
+        report = msgspec.json.decode(Path(options.read).read_bytes(), type=Report)
+    else:
+        report = _measure(options)
+    print(f"\n{TARGETS}\n{text_table(report.targets, limits=True)}")
+    if options.json:
+        data = msgspec.json.encode(report)
+        Path(options.json).write_bytes(msgspec.json.format(data) + b"\n")
+    if options.markdown:
+        _write_page(report, _write_charts(PICTURES, report))
+    if options.charts:
+        _write_charts(Path(options.charts), report)
+    missed = [f.name for s in report.sections for f in s.figures if f.decision is Decision.MISSED]
+    print(f"\n{len(missed)} targets missed" + "".join(f"\n  {name}" for name in missed))
+    return 0
+
+
+def _measure(options: Any) -> Report:
     settings = quick() if options.quick else Settings()
     about = machine.describe()
     print(about)
@@ -56,28 +90,27 @@ def main(arguments: list[str]) -> int:
     for name in options.names or NAMES:
         section = _run(name, settings)
         sections.append(section)
+        settings.tell(f"{name} took {section.seconds:.0f} s")
         print(f"\n{section.title}\n{text_table(section.figures)}", flush=True)
     targets = [figure for section in sections for figure in section.figures if figure.limit]
-    print(f"\n{TARGETS}\n{text_table(targets, limits=True)}")
-    if options.json:
-        data = {"machine": about, "quick": options.quick, "targets": targets, "sections": sections}
-        Path(options.json).write_bytes(msgspec.json.format(msgspec.json.encode(data)) + b"\n")
-    if options.markdown:
-        _write_page(about, targets, sections)
-    missed = [f.name for s in sections for f in s.figures if f.decision is Decision.MISSED]
-    print(f"\n{len(missed)} targets missed" + "".join(f"\n  {name}" for name in missed))
-    return 0
+    return Report(about, options.quick, targets, sections)
 
 
 def _parse(arguments: list[str]) -> Any:
     parser = argparse.ArgumentParser(prog="python -m tools.bench", description="Measure the speed.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"any of {', '.join(NAMES)}")
-    parser.add_argument("--quick", action="store_true", help="three minutes, rough figures")
+    parser.add_argument("--quick", action="store_true", help="five minutes, rough figures")
     parser.add_argument("--json", metavar="FILE", help="write all figures to FILE")
     parser.add_argument("--markdown", action="store_true", help=f"put the tables into {PAGE.name}")
+    parser.add_argument("--charts", metavar="FOLDER", help="draw charts of the figures there")
+    parser.add_argument(
+        "--read", metavar="FILE", help="measure nothing: take the figures of --json"
+    )
     options = parser.parse_args(arguments)
     if options.markdown and (options.names or options.quick):
         parser.error("--markdown goes with neither names nor --quick: the page shows a whole run")
+    if options.read and (options.names or options.quick):
+        parser.error("--read goes with neither names nor --quick: nothing is measured")
     for name in options.names:
         if name not in NAMES:
             parser.error(f"there is no benchmark {name!r}, expected any of {', '.join(NAMES)}")
@@ -86,21 +119,35 @@ def _parse(arguments: list[str]) -> Any:
 
 def _run(name: str, settings: Settings) -> Section:
     module = importlib.import_module(f"tools.bench.{name}")
+    begin = monotonic()
     try:
         figures = module.run(settings)
     except SkippedError as reason:
         figures = [skipped(name, reason)]
     except (RuntimeError, subprocess.SubprocessError) as error:
         figures = [Figure(name, f"failed: {error}", decision=Decision.MISSED)]
-    return Section(name, module.TITLE, figures)
+    return Section(name, module.TITLE, figures, round(monotonic() - begin, 1))
 
 
-def _write_page(about: str, targets: list[Figure], sections: list[Section]) -> None:
-    tables = [f"### {TARGETS}\n\n{markdown_table(targets, limits=True)}"]
-    tables += [f"### {s.title}\n\n{markdown_table(s.figures)}" for s in sections]
-    new = "\n\n".join([f"Machine: {about}. Made by `make bench ARGS=--markdown`.", *tables])
+def _write_page(report: Report, charts: Sequence[Chart]) -> None:
+    tables = [_shown(chart) for chart in charts]
+    tables += [f"### {TARGETS}\n\n{markdown_table(report.targets, limits=True)}"]
+    tables += [f"### {s.title}\n\n{markdown_table(s.figures)}" for s in report.sections]
+    made = f"Machine: {report.machine}. Made by `make bench ARGS=--markdown`."
+    new = "\n\n".join([made, *tables])
     text = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(replace_between(text, BEGIN, END, f"\n{new}\n"), encoding="utf-8")
+
+
+def _shown(chart: Chart) -> str:
+    return f"![{chart.title}]({PICTURES.name}/{chart.file})"
+
+
+def _write_charts(folder: Path, report: Report) -> Sequence[Chart]:
+    written = write_charts(folder, {s.name: s.figures for s in report.sections})
+    for chart in written:
+        print(f"{folder / chart.file}: {chart.title}")
+    return written
 
 
 if __name__ == "__main__":

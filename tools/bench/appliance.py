@@ -17,6 +17,7 @@ import msgspec
 
 from eap.runtime.folder import VARIABLE
 from eap.runtime.store import VARIABLE as STATE_VARIABLE
+from tools.bench.figures import Bar, BarKind, Figure, at_most
 from tools.bench.machine import ProcessSample, kernel_share, memory_folder
 from tools.bench.network import ROOT, Cable
 from tools.bench.pacing import wait
@@ -117,6 +118,29 @@ def observe(plant: Path, seconds: float, link: Cable | None) -> Observation:
             for key in ("p50", "p99", "max")
         },
     )
+
+
+def share_figure(
+    plant: str, seen: Observation, process: str, target: float, called: str = ""
+) -> Figure:
+    """Return the share of a core of one process in percent, beside the kernel's part of it.
+
+    Args:
+        plant: Name of the plant.
+        seen: Observation of it.
+        process: Name of the process there.
+        target: Largest share.
+        called: Name of the process in figures, if it has another one.
+    """
+    title = f"{plant}: {called or process}"
+    share, kernel = (side[process] * 100 for side in (seen.cpu, seen.kernel))
+    limit = f"the kernel's part of it: {kernel:.1f} %"
+    bars = [
+        Bar(called or process, share, BarKind.OURS),
+        Bar("kernel's part of it", kernel, BarKind.KERNEL),
+    ]
+    figure = at_most(f"{title}, share of one core", share, target, " %", limit=limit)
+    return figure.compared(title, "%", bars, target)
 
 
 def _pids(processes: dict[str, Any]) -> dict[str, int]:

@@ -18,7 +18,7 @@ from devicebus.wire.datagram import Command, Datagram, DatagramHeader, encode_fr
 from eap.codec.ethercat import ETHERTYPE
 from eap.net.busport import BUS_MULTICAST_MAC
 from tools.bench import buses, machine, rawloop
-from tools.bench.figures import Figure, SkippedError, at_least, median_ratio, report
+from tools.bench.figures import Bar, BarKind, Figure, SkippedError, at_least, median_ratio, report
 from tools.bench.network import Cable, Page, cable
 from tools.bench.rawloop import SLAVES
 from tools.bench.settings import Settings
@@ -63,7 +63,12 @@ def figures_of(
         name = f"bus cycles, 16 slaves {slaves}: of pysoem's own loop"
         detail = f"{left:.1f} of {right:.1f} thousand/s"
         said = f"the C loop: {limit:.1f} thousand/s" if number else ""
-        figures.append(at_least(name, median_ratio(pairs), 1.0, detail, limit=said))
+        bars = [Bar("ours", left, BarKind.OURS), Bar("SOEM (pysoem)", right, BarKind.PEER)]
+        if number:
+            bars.append(Bar("the C loop", limit, BarKind.LIMIT))
+        figure = at_least(name, median_ratio(pairs), 1.0, detail, limit=said)
+        title = f"16 slaves {slaves}"
+        figures.append(figure.compared(title, "thousand/s", bars, right))
     ratio = median_ratio((left[1], right[0]) for left, right in zip(ours, c, strict=True))
     detail = f"{median(rates[1] for rates in ours) / 1000:.1f} of {limit:.1f} thousand/s"
     name = "bus cycles, 16 slaves answered by C: of the C loop"

@@ -8,7 +8,7 @@ from statistics import median
 from time import perf_counter
 
 from tools.bench import machine
-from tools.bench.appliance import PROCESSES, Observation, observe, running
+from tools.bench.appliance import PROCESSES, Observation, observe, running, share_figure
 from tools.bench.figures import Figure, at_most, report
 from tools.bench.network import ROOT, Cable, cable
 from tools.bench.settings import Settings
@@ -41,15 +41,11 @@ def figures_of(ready_s: list[float], seen: Observation) -> list[Figure]:
     rss = {name: octets / _MEGA for name, octets in seen.rss.items()}
     own = sum(rss[name] for name in PROCESSES)
     listed = ", ".join(f"{name} {rss[name]:.0f}" for name in rss)
-    engine, segment = (seen.cpu[name] * 100 for name in ("engine", dearest))
-    in_kernel = [
-        f"the kernel's part of it: {seen.kernel[n] * 100:.1f} %" for n in ("engine", dearest)
-    ]
     return [
         at_most("demo: plant ready", median(ready_s), 1.5, " s", f"longest {max(ready_s):.2f} s",
                 limit="start of four interpreters and their imports"),
-        at_most("demo: engine, share of one core", engine, 5, " %", limit=in_kernel[0]),
-        at_most("demo: each segment, share of one core", segment, 2, " %", limit=in_kernel[1]),
+        share_figure("demo", seen, "engine", 5),
+        share_figure("demo", seen, dearest, 2, "dearest segment"),
         at_most("demo: resident memory of supervisor, engine and services", own, RSS_BEFORE_MB,
                 " MB", limit="before: 105 MB, and the segments"),
         report("demo: resident memory of all processes", f"{sum(rss.values()):.0f} MB ({listed})",

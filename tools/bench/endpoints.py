@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tools.bench import machine, rawloop
+from tools.bench.figures import BarKind
 from tools.bench.network import Cable, Page
 from tools.bench.stations import Shape
 
@@ -23,6 +24,7 @@ class Endpoint(NamedTuple):
         receive: Role of the receiver.
         package: Package of Python that it needs, and how it is called there.
         window: Whether the sender waits for its receiver; otherwise frames may be lost.
+        kind: Its kind in charts.
         batch: Frames that a call of the raw loop in C moves; 0 for a receiver that never sleeps.
     """
 
@@ -32,6 +34,7 @@ class Endpoint(NamedTuple):
     package: tuple[str, str] = ("", "")
     window: bool = True
     batch: int = 1
+    kind: BarKind = BarKind.PEER
 
     def lacks(self) -> str:
         """Return what this machine lacks for it, or an empty text."""

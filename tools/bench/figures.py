@@ -20,6 +20,39 @@ class Decision(StrEnum):
     SKIPPED = "skipped"
 
 
+class BarKind(StrEnum):
+    """Owner of a bar of a chart."""
+
+    OURS = "ours"
+    KERNEL = "kernel"
+    """The part of ours that the kernel needs."""
+    PEER = "peer"
+    LIMIT = "limit"
+    """The least that a raw loop or an echo does with the same bytes."""
+
+
+class Bar(msgspec.Struct, frozen=True):
+    """One value in a chart."""
+
+    name: str
+    value: float
+    kind: BarKind
+
+
+class Comparison(msgspec.Struct, frozen=True):
+    """Values of one quantity side by side, as a chart shows them.
+
+    Attributes:
+        bars: Ours first.
+        target: Value that ours should reach, in the same unit, if there is one.
+    """
+
+    title: str
+    unit: str
+    bars: tuple[Bar, ...]
+    target: float | None = None
+
+
 class Figure(msgspec.Struct, frozen=True):
     """One line of a table.
 
@@ -27,6 +60,7 @@ class Figure(msgspec.Struct, frozen=True):
         value: Number behind *measured*, where there is one.
         limit: The machine's own limit, which bounds the figure; a figure with one is among the
             targets of the project.
+        comparison: Values behind it, for a chart.
     """
 
     name: str
@@ -35,6 +69,15 @@ class Figure(msgspec.Struct, frozen=True):
     decision: Decision = Decision.REPORTED
     value: float | None = None
     limit: str = ""
+    comparison: Comparison | None = None
+
+    def compared(
+        self, title: str, unit: str, bars: Iterable[Bar], target: float | None = None
+    ) -> Figure:
+        """Return the figure with the values behind it."""
+        return msgspec.structs.replace(
+            self, comparison=Comparison(title, unit, tuple(bars), target)
+        )
 
 
 class SkippedError(Exception):

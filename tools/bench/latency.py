@@ -8,16 +8,29 @@ from typing import Any
 
 from tools.bench import machine
 from tools.bench.endpoints import Endpoint, carry
-from tools.bench.figures import Figure, SkippedError, at_most, median_ratio, report, skipped
+from tools.bench.figures import (
+    Bar,
+    BarKind,
+    Figure,
+    SkippedError,
+    at_most,
+    median_ratio,
+    report,
+    skipped,
+)
 from tools.bench.network import Cable, cable
 from tools.bench.settings import Settings
 from tools.bench.stations import Shape
 
 TITLE = "One-way latency of a 600-byte PD at 1 kHz, woken on arrival, beside blocking loops"
 SHAPE = Shape(1, 1, 600)
-OURS = Endpoint("ours", "product_roles.publish_paced", "product_roles.subscribe_on_arrival")
-RAW = Endpoint("the raw Python loop", "raw_roles.send_paced", "raw_roles.receive_stamps")
-C = Endpoint("the C loop", "c.send_paced", "c.receive_stamps")
+OURS = Endpoint(
+    "ours", "product_roles.publish_paced", "product_roles.subscribe_on_arrival", kind=BarKind.OURS
+)
+RAW = Endpoint(
+    "the raw Python loop", "raw_roles.send_paced", "raw_roles.receive_stamps", kind=BarKind.LIMIT
+)
+C = Endpoint("the C loop", "c.send_paced", "c.receive_stamps", kind=BarKind.LIMIT)
 PEERS = tuple(
     Endpoint(name, f"{module}.send_paced", f"{module}.receive_stamps", package)
     for name, module, package in (
@@ -66,6 +79,12 @@ def figures_of(
             figures.append(at_most(title, ratio, target, "", detail, limit=limit))
         else:
             figures.append(report(title, f"{ratio:.2f} ({detail})", ratio))
+    middle = {each: median(found["p50"] for found in results[each]) / 1000 for each in results}
+    bars = [Bar(way.name, middle[way.name], way.kind) for way in (OURS, RAW, C, *PEERS)
+            if way.name in middle]  # fmt: skip
+    figures[0] = figures[0].compared(
+        name.removeprefix("latency, "), "µs", bars, target * middle[RAW.name]
+    )
     raw = results[RAW.name]
     tails = ", ".join(f"{key} {_us(ours, key)} to {_us(raw, key)} µs" for key in ("p99", "max"))
     return [*figures, report(f"{name}: tails, ours to {RAW.name}", tails)]

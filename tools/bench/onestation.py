@@ -15,7 +15,7 @@ from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
 from eap.ids import MacAddr, NetId
 from tools.bench import machine, rawloop
 from tools.bench.appliance import running, status
-from tools.bench.figures import Figure, SkippedError, at_most, median_ratio, report
+from tools.bench.figures import Bar, BarKind, Figure, SkippedError, at_most, median_ratio, report
 from tools.bench.machine import ProcessSample
 from tools.bench.network import Cable, Page, cable
 from tools.bench.pacing import wait
@@ -53,15 +53,17 @@ def figures_of(pairs: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> list[F
     ratio = median_ratio((left["cpu"], right["cpu"]) for left, right in pairs)
     counts = [left for left, _ in pairs]
     lost, received = (sum(each[key] for each in counts) for key in ("lost", "received"))
+    share = at_most(
+        "one station, one PD each way at 1 ms: share of a core, of a C loop",
+        ratio,
+        1.5,
+        "",
+        f"{ours:.1f} to {theirs:.1f} %",
+        limit=f"C loop with the same bytes: {theirs:.1f} %",
+    )
+    bars = [Bar("engine", ours, BarKind.OURS), Bar("the C loop", theirs, BarKind.LIMIT)]
     return [
-        at_most(
-            "one station, one PD each way at 1 ms: share of a core, of a C loop",
-            ratio,
-            1.5,
-            "",
-            f"{ours:.1f} to {theirs:.1f} %",
-            limit=f"C loop with the same bytes: {theirs:.1f} %",
-        ),
+        share.compared("one station, one PD each way at 1 ms", "%", bars, 1.5 * theirs),
         report("PDs lost by the station", f"{lost} of {received}", lost),
     ]
 

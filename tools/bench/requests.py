@@ -16,7 +16,7 @@ import msgspec
 
 from tools.bench import machine
 from tools.bench.appliance import running, status
-from tools.bench.figures import Figure, median_ratio, report, skipped
+from tools.bench.figures import Bar, BarKind, Figure, median_ratio, report, skipped
 from tools.bench.network import Worker
 from tools.bench.pacing import wait
 from tools.bench.plants import many_values
@@ -95,7 +95,9 @@ def figure_of(protocol: Protocol, pairs: Sequence[tuple[float, float]]) -> Figur
     ratio = median_ratio(pairs)
     name = f"reads by {protocol.name} of {protocol.what}: of the server of {protocol.package[0]}"
     detail = f"{ours:.2f} to {theirs:.2f} thousand/s"
-    return report(name, f"{ratio:.2f} ({detail})", ratio)
+    bars = [Bar("ours", ours, BarKind.OURS), Bar(protocol.package[0], theirs, BarKind.PEER)]
+    figure = report(name, f"{ratio:.2f} ({detail})", ratio)
+    return figure.compared(f"{protocol.name}: {protocol.what}", "thousand/s", bars)
 
 
 def plant(protocol: Protocol) -> bytes:

@@ -11,13 +11,13 @@ import msgspec
 class Settings(msgspec.Struct, frozen=True):
     """The durations of one run, in seconds unless the name says otherwise."""
 
-    rounds: int = 7
-    throughput_s: float = 1.0
-    latency_s: float = 4.0
-    lateness_s: float = 12.0
-    solar_s: float = 60.0
-    search_s: float = 5.0
-    cycle_s: float = 60.0
+    rounds: int = 5
+    throughput_s: float = 0.6
+    latency_s: float = 2.0
+    lateness_s: float = 8.0
+    solar_s: float = 25.0
+    search_s: float = 4.0
+    cycle_s: float = 25.0
     micro_repeats: int = 7
     started: float = msgspec.field(default_factory=monotonic)
 
@@ -31,10 +31,10 @@ def quick() -> Settings:
     return Settings(
         rounds=2,
         throughput_s=0.3,
-        latency_s=1.0,
-        lateness_s=2.0,
-        solar_s=10.0,
+        latency_s=0.5,
+        lateness_s=1.5,
+        solar_s=3.0,
         search_s=1.5,
-        cycle_s=5.0,
+        cycle_s=3.0,
         micro_repeats=3,
     )

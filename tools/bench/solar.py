@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tools.bench import machine
-from tools.bench.appliance import PROCESSES, Observation, observe
+from tools.bench.appliance import PROCESSES, observe, share_figure
 from tools.bench.figures import Figure, at_most, report
 from tools.bench.network import ROOT, cable
 from tools.bench.plants import line
@@ -38,17 +38,11 @@ def run(settings: Settings) -> list[Figure]:
     late = ", ".join(f"{key} {value} µs" for key, value in seen.lateness_us.items())
     return [
         at_most("frames lost", seen.lost, 0, " ", f"of {seen.received} received"),
-        at_most("solar line: engine, share of one core", seen.cpu["engine"] * 100, 8, " %",
-                limit=_of_kernel(seen)),
-        at_most("solar line without generated values: engine, share of one core",
-                still.cpu["engine"] * 100, 5, " %", limit=_of_kernel(still)),
+        share_figure("solar line", seen, "engine", 8),
+        share_figure("solar line without generated values", still, "engine", 5),
         at_most("engine, resident memory", seen.rss["engine"] / _MEGA, 60, " MB"),
         report("resident memory of each process", memory),
         report("the other processes, share of one core", share),
         report("lateness of the worst station", late),
         report("cycles left out", f"{seen.overruns} of {seen.cycles}", seen.overruns),
-    ]  # fmt: skip
-
-
-def _of_kernel(seen: Observation) -> str:
-    return f"the kernel's part of it: {seen.kernel['engine'] * 100:.1f} %"
+    ]

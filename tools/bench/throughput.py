@@ -12,18 +12,22 @@ from typing import NamedTuple
 
 from tools.bench import machine
 from tools.bench.endpoints import Endpoint, carry
-from tools.bench.figures import Figure, at_least, median_ratio, report, skipped
+from tools.bench.figures import Bar, BarKind, Figure, at_least, median_ratio, report, skipped
 from tools.bench.network import Cable, cable
 from tools.bench.settings import Settings
 from tools.bench.stations import Shape
 
 TITLE = "Throughput: frames received per second, publisher and subscriber on a core each"
 
-OURS = Endpoint("ours", "product_roles.publish", "product_roles.subscribe")
-RAW = Endpoint("the raw Python loop", "raw_roles.send", "raw_roles.receive")
-C = Endpoint("the C loop", "c.send", "c.receive")
-C_SPINNING = Endpoint("a C loop that never sleeps", "c.send", "c.receive", batch=0)
-C_BATCH = Endpoint("a C loop with batches of 32", "c.send", "c.receive", batch=32)
+OURS = Endpoint("ours", "product_roles.publish", "product_roles.subscribe", kind=BarKind.OURS)
+RAW = Endpoint("the raw Python loop", "raw_roles.send", "raw_roles.receive", kind=BarKind.LIMIT)
+C = Endpoint("the C loop", "c.send", "c.receive", kind=BarKind.LIMIT)
+C_SPINNING = Endpoint(
+    "a C loop that never sleeps", "c.send", "c.receive", batch=0, kind=BarKind.LIMIT
+)
+C_BATCH = Endpoint(
+    "a C loop with batches of 32", "c.send", "c.receive", batch=32, kind=BarKind.LIMIT
+)
 ZMQ = Endpoint(
     "ZeroMQ PUB/SUB", "zmq_roles.send", "zmq_roles.receive", ("pyzmq", "zmq"), window=False
 )
@@ -96,6 +100,14 @@ def figures_of(case: Case, rates: Mapping[str, Sequence[float]]) -> list[Figure]
         limit = case.limit.name
         limit += f": {middle[limit]:.0f} thousand/s" if limit in middle else ", not measured"
         figures.append(at_least(name, ratio, target, detail, limit=limit))
+    bars = [Bar(each.name, middle[each.name], each.kind) for each in (OURS, *case.beside)
+            if each.name in middle]  # fmt: skip
+    goal = max(
+        (target * middle[way.name] for way, target in case.beside.items()
+         if target is not None and way.name in middle),
+        default=None,
+    )  # fmt: skip
+    figures[0] = figures[0].compared(case.name, "thousand/s", bars, goal)
     return figures
 
 
