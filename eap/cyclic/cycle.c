@@ -176,12 +176,12 @@ static int end_cycle(Cycle *self, int64_t cycle, int64_t late_ns, PyObject *now)
     return 0;
 }
 
-/* cycle(due_ns, now_ns) */
+/* cycle(due_ns, now_ns, behind_ns=0) */
 static PyObject *cycle_call(Cycle *self, PyObject *args, PyObject *keywords) {
-    long long due_ns;
+    long long due_ns, behind_ns = 0;
     PyObject *now;
     (void)keywords;
-    if (!PyArg_ParseTuple(args, "LO", &due_ns, &now))
+    if (!PyArg_ParseTuple(args, "LO|L", &due_ns, &now, &behind_ns))
         return NULL;
     int64_t *words = self->buffer.buf, now_ns = PyLong_AsLongLong(now);
     if (now_ns == -1 && PyErr_Occurred())
@@ -196,7 +196,7 @@ static PyObject *cycle_call(Cycle *self, PyObject *args, PyObject *keywords) {
                                      : refresh(self);
     if (changed < 0 || (changed && call(self->parts[READ_CONTROLS], NULL) < 0)
         || (self->sends && send_all(self, cycle, now)) || call_all(self->parts[CLOSING], now)
-        || end_cycle(self, cycle, now_ns - due_ns, now))
+        || end_cycle(self, cycle, now_ns - due_ns - behind_ns, now))
         return NULL;
     Py_RETURN_NONE;
 }

@@ -229,11 +229,11 @@ class Twins:
         self.now_ns = 1000 * MS
         self.number = 0
 
-    def cycle(self, late_ns: int = 0) -> list[bytes]:
+    def cycle(self, late_ns: int = 0, *behind_ns: int) -> list[bytes]:
         self.now_ns += MS
         for side in self.sides:
             with side.mode():
-                side.station.cycle(self.now_ns - late_ns, self.now_ns)
+                side.station.cycle(self.now_ns - late_ns, self.now_ns, *behind_ns)
         return self.compare()
 
     def compare(self) -> list[bytes]:
@@ -289,8 +289,10 @@ def is_direct(side: Side, yes: bool) -> None:
 
 STATES = (DeviceState.SAFEOP, DeviceState.PREOP, DeviceState.OP)
 value = st.integers(0, 3)
+late_ns = st.sampled_from((0, 0, 900, 2_500_000, -7_000, 300_000_000))
 steps = st.one_of(
-    st.tuples(st.just("cycle"), st.sampled_from((0, 0, 900, 2_500_000, -7_000, 300_000_000))),
+    st.tuples(st.just("cycle"), late_ns),
+    st.tuples(st.just("cycle"), late_ns, late_ns),
     st.tuples(st.just("put"), st.sampled_from(("x", "y", "flag", "bit", "two")), value),
     st.tuples(
         st.just("put"),
@@ -320,8 +322,8 @@ class Run:
         what, *args = step
         getattr(self, what)(*args)
 
-    def cycle(self, late_ns: int) -> None:
-        self.twins.cycle(late_ns)
+    def cycle(self, late_ns: int, *behind_ns: int) -> None:
+        self.twins.cycle(late_ns, *behind_ns)
 
     def put(self, name: str, number: int) -> None:
         if name in self.twins.sides[0].image.slots:
