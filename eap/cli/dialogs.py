@@ -38,7 +38,7 @@ class FilteredScreen(Screen[None]):
         self.query_one("#table").focus()
 
 
-class Form(ModalScreen[ResultT]):
+class DialogForm(ModalScreen[ResultT]):
     """Fields that stay until their request succeeds; the result is None if the form is left."""
 
     @on(Button.Pressed, "#leave")

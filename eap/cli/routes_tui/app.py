@@ -18,7 +18,7 @@ from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.widgets import Button, Checkbox, DataTable, Footer, Input, Label, Static
 
 from eap.cli import routes_view
-from eap.cli.dialogs import FilteredScreen, Form, Message, Question
+from eap.cli.dialogs import DialogForm, FilteredScreen, Message, Question
 from eap.cli.routes_tui.table import (
     STYLES,
     Line,
@@ -358,7 +358,7 @@ class Tick(Checkbox):
         super().watch_value()
 
 
-class RouteForm(Form[list[str]]):
+class RouteForm(DialogForm[list[str]]):
     """The fields of a route; it stays until the route is taken, or the form is left.
 
     Its result is the warnings about the route, or None if it was cancelled.

@@ -13,7 +13,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.widgets import Button, Input, Static
 
-from eap.cli.dialogs import Form
+from eap.cli.dialogs import DialogForm
 from eap.live.rows import BusRow, PdFlow, StationRow
 from eap.quantities import count
 from eap.runtime.recordings import RecordingState
@@ -77,7 +77,7 @@ def end_recording(name: str) -> str:
     return f"recording {state.name!r}: {things}, {lost}; {', '.join(state.files)}"
 
 
-class RecordForm(Form[str]):
+class RecordForm(DialogForm[str]):
     """The path of a recording; its result is what is recorded, or None if it was cancelled.
 
     Args:
