@@ -133,6 +133,7 @@ class Bridge:
         left = len(values)
         try:
             for station, own in by_station.items():
+                # The appliance checks all values of a station before it writes the first.
                 await self._writer.call(WRITE, station=station, values=own, origin=origin)
                 left -= len(own)
         except EapError:

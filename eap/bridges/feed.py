@@ -115,6 +115,7 @@ def select(
             variable = name.removeprefix(f"{station}/")
             if variable != name and (made := _variable(by_name, station, variable)) is not None:
                 found[variable] = made
+    # Members and elements are no variables of the station: they come behind these.
     order = {name: position for position, name in enumerate(by_name)}
     return sorted(found.values(), key=lambda each: order.get(each.variable, len(order)))
 
@@ -230,6 +231,7 @@ class BridgeFeed:
             self._on_variables()
         for number, station in enumerate(stations):
             running = self._watches.get(station)
+            # A subscription has its names from its begin on: other variables need another one.
             if running is not None and (station in changed or running.done()):
                 running.cancel()
                 running = None
@@ -255,6 +257,7 @@ class BridgeFeed:
 
     def _take(self, event: ValuesEvent) -> None:
         old_ns = OLD_NS + self._period_ms * 1_000_000
+        # 0 comes from an appliance of an older release, which sends no time.
         is_old = 0 < event.time_ns < self._now() - old_ns
         changed = {}
         for variable, value in event.values.items():
@@ -266,6 +269,7 @@ class BridgeFeed:
             before = self.samples.get(name)
             sample = Sample(value, quality, event.time_ns - age * QUALITY_NS)
             self.samples[name] = sample
+            # Without the time, which is another one in every cycle.
             is_as_before = before is not None and before[:2] == sample[:2]
             if not is_as_before or name in self._to_report:
                 changed[name] = sample

@@ -76,6 +76,7 @@ def run_bridge(
                 startup.step(reason)
         return reason
 
+    # Reasons outside of this program, such as a port that is in use, need no traceback.
     if reason := asyncio.run(run()):
         logging.getLogger(__name__).error("%s", reason)
         return 2
@@ -95,6 +96,7 @@ async def _run(
 
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(each) for each in (bridge.report(), serve())]
+        # Until it is ready its steps are watched: a sign of life would hide that one of them hangs.
         await wait_for_end(ended, parent, lambda: beat() if bridge.is_ready else None)
         for task in tasks:
             task.cancel()

@@ -85,6 +85,7 @@ class ControlReply(msgspec.Struct, frozen=True, omit_defaults=True):
     event: dict[str, Any] | None = None
 
 
+# Unknown fields are refused: a misspelt one would make another request of it.
 class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of the parameters of all methods."""
 
@@ -289,6 +290,7 @@ def decode_request(line: bytes) -> Request:
     except ValueError as exc:  # of msgspec, or of UTF-8
         raise ControlError(f"not a request: {exc}", code=ErrorCode.BAD_REQUEST) from None
     except RecursionError:
+        # msgspec raises RecursionError, which is none of its own errors.
         raise ControlError("not a request: nested too deep", code=ErrorCode.BAD_REQUEST) from None
     if request.v != VERSION:
         raise ControlError(

@@ -118,6 +118,7 @@ def load_configuration(dictionary: EapDictionary, plain: object) -> None:
     if stored.version != VERSION:
         detail = f"version {stored.version}, this release knows {VERSION}"
         raise StoredError(f"stored configuration: {detail}")
+    # Another kind of port gives the same indexes another meaning.
     if stored.profile != dictionary.identity.module_profile:
         detail = f"profile {stored.profile}, this is {dictionary.identity.module_profile}"
         raise StoredError(f"stored configuration: {detail}")
@@ -324,13 +325,16 @@ class _Comparison:
             before = {sub: entry.octets for sub, entry in fresh.entries.items()}
         if row in profile.VARIABLES and before[Var.TYPE_NAME] != after[Var.TYPE_NAME]:
             entry = self._new_dictionary[index].entries[Var.DEFAULT]
+            # Writing another type resets the default.
             before |= {Var.DEFAULT_GIVEN: _NONE, Var.DEFAULT: entry.default}
         if row is profile.TX_FRAME and index in self._old and self._is_rewritten(index):
+            # _cut_lists has emptied the list of the frame.
             before = {sub: octets for sub, octets in before.items() if sub < FrameSub.TXPD}
         if row is profile.RX_PD and before[Rx.PUBLISHER] != after[Rx.PUBLISHER]:
             before[Rx.SOURCE] = b""  # as writing the publisher does
         for subindex in _REFERENCES.get(row.first, ()):
             if before[subindex] != after[subindex]:
+                # _cleared_references has cleared it.
                 before[subindex] = bytes(2)
         return before
 

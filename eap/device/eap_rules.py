@@ -94,11 +94,13 @@ def _name(data: bytes, _entry: Entry) -> bytes:
 
 
 def _type(data: bytes, _entry: Entry) -> bytes:
+    # In its canonical text, so that two writings of one type compare as equal.
     return datatypes.parse(data.decode()).text.encode()
 
 
 def _flags(data: bytes, _entry: Entry) -> bytes:
     known = RxFlag.ENABLED | RxFlag.IGNORE_NETID | RxFlag.IGNORE_VERSION
+    # A flag of a later release must not be stored without an effect.
     if data[0] & ~known:
         raise ValueError(f"flags 0x{data[0]:02X}: of the flags 0x{known:02X} only")
     return data
@@ -118,6 +120,7 @@ def _group(data: bytes, _entry: Entry) -> bytes:
     text = data.decode()
     if text and not (is_group(text, "ethernet") or is_group(text, "udp")):
         raise ValueError(f"{text!r} is no multicast address (MAC or IPv4)")
+    # One form of an address, so that equal groups compare as equal.
     return str(MacAddr.parse(text)).encode() if ":" in text or "-" in text else data
 
 

@@ -152,6 +152,7 @@ class AdsConnection:
             number = getattr(exc, "errno", None)
             why = os.strerror(number) if number else "it does not answer"
             raise gone(f"{address.host} cannot be reached at port {AMS_TCP_PORT}: {why}") from None
+        # Answers come by this connection: the router needs no route to this NetID.
         own = IPv4Address(writer.get_extra_info("sockname")[0])
         return cls(reader, writer, target, NetId(own.packed + b"\1\1"))
 
@@ -163,6 +164,7 @@ class AdsConnection:
         """
         if method == "write":
             return await self._write(parameters(params, WriteParameters))
+        # AMS has invoke IDs of its own, so that one number does for all lines.
         line = encode_request(1, method, params).rstrip(b"\n")
         configures = CONFIGURE_METHODS.get(method)
         if configures is not None:
@@ -180,6 +182,7 @@ class AdsConnection:
             answer, head = await self._rest(head.ticket, 0)
         while len(answer) < head.total:
             more, head = await self._rest(head.ticket, len(answer))
+            # A router that answers with nothing would be asked for ever.
             if not more:
                 raise gone("the appliance answered with less than it announced")
             answer += more
@@ -252,6 +255,7 @@ class AdsConnection:
                 raise ControlError(f"variable {name}: {exc}", code=ErrorCode.VALUE) from None
         port = await self._port(wanted.station)
         for name, data in octets.items():
+            # A symbol may have moved since the last write: the plant is changed while it runs.
             lookup = ReadWrite(
                 IndexGroup.SYMBOL_BY_NAME, 0, SymbolAddress.SIZE, name.encode() + b"\0"
             )
@@ -307,6 +311,7 @@ class AdsConnection:
             while True:
                 prefix = await self._reader.readexactly(AmsTcpHeader.SIZE)
                 header, body = decode_packet(await self._reader.readexactly(decode_prefix(prefix)))
+                # An answer that comes after its time-out has no waiter any more.
                 answer = self._waiting.get(header.invoke_id)
                 if answer is not None and not answer.done():
                     answer.set_result(AmsAnswer(bytes(body), header.error_code))

@@ -77,6 +77,8 @@ class LiveClient:
                 connection = await self._connected()
                 async with aclosing(connection.watch(wanted)) as events:
                     async for event in events:
+                        # An error on a connection that was just made must not begin the short
+                        # pauses anew.
                         if isinstance(event, ValuesEvent):
                             backoff.reset()
                         yield event

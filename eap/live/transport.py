@@ -168,6 +168,7 @@ class UnixConnection:
                 watch = self._watches.setdefault(reply.subscription, _LatestValues())
                 watch.put(reply.event)
         elif reply.id is None:  # an error that ends the connection
+            # No request is to blame for a line without a number: the server refuses the connection.
             self._end(reply.error.message if reply.error else "the appliance refused a line")
         elif (answer := self._waiting.get(reply.id)) is not None and not answer.done():
             answer.set_result(reply)
@@ -206,6 +207,7 @@ class _LatestValues:
         if event is None:
             assert self._end is not None  # noqa: S101
             raise self._end
+        # The end stays known: every later call raises it, too.
         if self._end is None:
             self._has_news.clear()
         return event
@@ -216,6 +218,7 @@ def _merged(before: ValuesEvent | ControlError | None, event: ValuesEvent) -> Va
         return event
     return replace(
         event,
+        # An event may have only some of the values: those of the one before are still the latest.
         values=before.values | event.values,
         quality=before.quality | event.quality,
         stale=(*(name for name in before.stale if name not in event.values), *event.stale),

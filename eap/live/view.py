@@ -184,6 +184,8 @@ class LiveView:
 
     def _documents(self) -> list[dict[str, Any]]:
         """Return the answers; a station that several sources show is that of the first."""
+        # A remote station may be reached by several hosts, of which each shows all of its
+        # appliance.
         known: set[StationKey] = set()
         documents = []
         for source in self._sources.values():

@@ -48,6 +48,7 @@ class DiskThread:
 
     def write(self, block: CapturedBlock) -> bool:
         """Write a block; return False if too much waits already, and it is lost."""
+        # A disk that hangs must not take all memory of the host.
         if self._waiting + len(block.data) > QUEUE_BYTES:
             return False
         self._post(lambda files: self._write(files, block), len(block.data))
@@ -110,6 +111,7 @@ class DiskThread:
             try:
                 step(self._files)
                 if time_ns() >= flush_ns:
+                    # Also while blocks come all the time, when get() never times out.
                     flush_ns = time_ns() + int(_FLUSH_S * 1e9)
                     self._files.flush()
             except OSError as exc:

@@ -133,6 +133,7 @@ class FileSequence:
         self._file = make(path, time_ns)
         self._began_ns = time_ns
         self.paths.append(path)
+        # The next file exists by now: a failure leaves one more, never one less.
         while self._keep and len(self.paths) > self._keep:
             self.paths.pop(0).unlink(missing_ok=True)
         return path
@@ -217,6 +218,7 @@ class FileSequence:
     def _next_path(self) -> Path:
         while True:
             self._number += 1
+            # A single file has the name that its user has given.
             number = f"-{self._number:04d}" if self._numbered or self._number > 1 else ""
             path = self._base.with_name(f"{self._base.name}{number}{self._ending}")
             if not path.exists():

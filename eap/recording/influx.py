@@ -109,6 +109,7 @@ class InfluxStore:
             connection.close()
         # An empty write is a bad request to some servers, and nothing more than that.
         if answer.status >= 300 and not (not body and answer.status == 400):
+            # 408 and 429 ask for another attempt (RFC 9110, RFC 6585).
             is_final = answer.status in _FINAL and answer.status not in {408, 429}
             reason = " ".join(f"HTTP {answer.status} {text}".split())
             raise StoreError(reason, is_final=is_final)
@@ -146,6 +147,7 @@ def _field(value: Any) -> str:
     if isinstance(value, bool):
         return "t" if value else "f"
     if isinstance(value, int):
+        # Integers of the protocol are signed and have 64 bits.
         return f"{value}i" if value < 1 << 63 else repr(float(value))
     if isinstance(value, float):
         # The protocol has neither infinities nor NaN.

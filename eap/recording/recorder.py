@@ -236,6 +236,7 @@ class Attachment(Closeable):
             if select_variables(layout, options.patterns):
                 every = options.every_cycles
                 if options.every_ms:
+                    # There is one sample a cycle: the period becomes a number of cycles.
                     every = max(1, round(1000 * options.every_ms / layout.cycle_us))
                 capture = StationCapture(self._paths[layout.station], every)
                 self._stations.append(capture)
@@ -327,6 +328,7 @@ class Recorder:
             if now_ns >= self._attach_ns:
                 self._attach_ns = now_ns + _ATTACH_NS
                 self._attach()
+            # The first samples of a plant that was just found are taken at once.
             return now_ns + (_LOOK_NS if self._attached is None else 0)
         offset_ns = unix_offset_ns()
         try:
@@ -346,6 +348,7 @@ class Recorder:
         if self._attached is not None:
             folder = ApplianceFolder(Path(self._options.folder))
             if not folder.is_alive():
+                # The shared memory of a killed appliance stays readable, without new samples.
                 self._detach("the plant does not run")
         state = self.state
         state.messages, state.octets = self._files.messages, self._files.octets
@@ -433,6 +436,7 @@ class Recorder:
         if self._attached is not None:
             self._attached.close()
             self._attached = None
+        # The plant may stay away for long: its file is whole in the meantime.
         self._disk.close_file(monotonic_ns() + unix_offset_ns())
         self._trigger.reset()
         if self._ring is not None:
@@ -462,6 +466,7 @@ class Recorder:
             self._act(attached, now_ns + offset_ns, action)
 
     def _write(self, block: CapturedBlock) -> None:
+        # Looks go on while the disk is slow: samples stay in shared memory for a short time only.
         if not self._disk.write(block):
             lost = _count(block)
             self.state.lost += lost

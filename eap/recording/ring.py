@@ -44,6 +44,7 @@ class BlockRing:
 
     def add(self, block: CapturedBlock) -> None:
         """Keep *block*, and drop what is too old or too much."""
+        # Short blocks do not become shorter.
         packed = len(block.data) >= _COMPRESS_FROM
         if packed:
             block = block._replace(data=self._compress(block.data))
@@ -51,6 +52,7 @@ class BlockRing:
         self.size += len(block.data)
         while self._blocks[0][0].last_ns < block.last_ns - self._length_ns:
             self._drop()
+        # The newest block stays in any case.
         while self.size > self._limit and len(self._blocks) > 1:
             self._drop()
             self.is_cut = True

@@ -141,6 +141,7 @@ class StoreSink:
         table, messages = found
         count = 0
         for cycle, time_ns, sample in samples_in(block):
+            # The same values as in a file: packing knows types and members already.
             _, values = messages.unpack(messages.pack(cycle, sample))
             self._sequence.queue(StoreRow(table, time_ns, cycle, values))
             count += 1

@@ -146,6 +146,7 @@ class Api:
             return refused
         if token := request[TOKEN]:
             self._guard.sessions.end(token)
+            # A WebSocket has shown its session only once, when it began.
             await self._end_session(token)
         response = answer({"user": None})
         self._guard.set_cookie(response, "")
@@ -168,6 +169,7 @@ class Api:
         self.update_pages()
         pages = [msgspec.to_builtins(page) for page in self._pages]
         for page in pages:
+            # Lines of the plant file and paths of this host are not for browsers.
             del page["at"]
             for panel in page["panels"]:
                 del panel["at"]
@@ -217,6 +219,7 @@ class Api:
     def _read_picture(self, file: str) -> str:
         changed_s = Path(file).stat().st_mtime
         known_s, svg = self._pictures.get(file, (0.0, ""))
+        # A picture may be edited while the page is served.
         if changed_s != known_s:
             svg = read_picture(Path(file)).svg
             self._pictures[file] = changed_s, svg

@@ -114,6 +114,7 @@ class _Sample:
         self.cycle_at_s = 0.0
 
     def take(self, event: ValuesEvent, now_s: float) -> None:
+        # A station whose engine hangs still answers, with the cycle of before.
         if self.event is None or self.event.cycle != event.cycle:
             self.cycle_at_s = now_s
         self.event, self.at_s = event, now_s
@@ -185,6 +186,7 @@ class PlantFeed:
                 found[pattern] = None
                 continue
             found |= dict.fromkeys(match_names(pattern, known))
+            # The state is in no directory: a pattern for all variables leaves it out.
             states = [f"{station}/{STATE}" for station in self.directories]
             if pattern.endswith(f"/{STATE}"):
                 found |= dict.fromkeys(match_names(pattern, states))
@@ -207,6 +209,7 @@ class PlantFeed:
     def want(self, fast: Iterable[str], slow: Iterable[str]) -> None:
         """Have these values kept current, all others not."""
         wanted: dict[tuple[str, int], set[str]] = {}
+        # What is read fast is not read a second time slowly.
         for period_ms, names in ((FAST_MS, set(fast)), (SLOW_MS, set(slow) - set(fast))):
             for name in names:
                 station, _, variable = name.partition("/")
@@ -354,6 +357,7 @@ class PlantFeed:
         still_s = now_s - sample.cycle_at_s
         is_stale = still_s > sample.period_s + _STALE_AFTER_S
         value = sample.event.values.get(variable)
+        # Only what is received has a quality; other values are as old as their cycle.
         if variable not in sample.event.quality:
             return ShownValue(value, int(still_s * 1e6), is_stale)
         quality = sample.event.quality[variable]
@@ -397,6 +401,7 @@ class PlantFeed:
             report = self.report
             for row in report.status.stations if report else ():
                 await self._read_directory(row["name"])
+            # Pages have nothing to show before the first directory.
             await asyncio.sleep(_DIRECTORY_S if self.directories else 0.1)
 
     async def _read_directory(self, station: str) -> None:
@@ -433,6 +438,8 @@ class PlantFeed:
             return
         for key in [key for key in self._watches if key not in self._wanted]:
             self._watches.pop(key)[1].cancel()
+            # Values that are no longer read grow old, and must not be shown when a page wants them
+            # again.
             self._samples.pop(key, None)
         for key, names in self._wanted.items():
             try:

@@ -136,6 +136,7 @@ def session_key(plant: str) -> bytes:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         key = secrets.token_bytes(KEY_BYTES)
         with whole_file(path) as file:
+            # Before there is content: other users must not read it even for a moment.
             os.fchmod(file.fileno(), 0o600)
             file.write(key)
     except (OSError, EnvironmentalError) as exc:
@@ -151,6 +152,7 @@ def _read_key(path: Path) -> bytes | None:
         return None
     with os.fdopen(fd, "rb") as file:
         mode = os.fstat(file.fileno()).st_mode
+        # One byte more, so that a file that is too long is noticed.
         key = file.read(KEY_BYTES + 1)
     # Anyone who read it could make sessions of every user.
     return key if len(key) == KEY_BYTES and not mode & 0o077 else None

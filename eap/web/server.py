@@ -106,6 +106,7 @@ async def _static(name: str, request: web.Request) -> web.Response:
     path = STATIC / name
     stat = path.stat()
     tag = f'"{stat.st_mtime_ns:x}-{stat.st_size:x}"'
+    # After an update of the package a browser must not mix old files with new ones.
     headers = {"ETag": tag, "Cache-Control": "no-cache"}
     if request.headers.get("If-None-Match") == tag:
         return web.Response(status=304, headers=headers)
@@ -146,8 +147,10 @@ def tls_context(section: ServerSection) -> ssl.SSLContext | None:
     if section.tls is None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    # RFC 8996: the versions before must not be used.
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
+        # With a password given, even an empty one, OpenSSL asks for none at a terminal.
         context.load_cert_chain(section.tls.certificate, section.tls.key, password=lambda: b"")
     except (OSError, ssl.SSLError) as exc:
         reason = exc.strerror or exc
@@ -222,6 +225,7 @@ class Connections:
 
     def _is_full(self, host: str) -> bool:
         known = self._beginning.union(self._server.connections)
+        # aiohttp tells which connections are open, not when one has ended.
         self._hosts = {each: own for each, own in self._hosts.items() if each in known}
         hosts = Counter(self._hosts.values())
         return hosts.total() >= MAX_CONNECTIONS or hosts[host] >= MAX_PER_HOST
@@ -235,6 +239,7 @@ class Connections:
             # A client that does not answer the end of TLS holds its place no longer than that.
             timeouts = {"ssl_handshake_timeout": HANDSHAKE_S, "ssl_shutdown_timeout": SHUTDOWN_S}
         try:
+            # The kernel ends the connection of a client that acknowledges nothing.
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(SLOW_READER_S * 1000))
             await asyncio.get_running_loop().connect_accepted_socket(
                 lambda: handler, sock, ssl=self._context, **timeouts

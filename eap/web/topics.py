@@ -140,6 +140,7 @@ class PageTopics:
         self._refresh()
         for topic in found.values():
             for part in self._parts(topic):
+                # A new client does not wait for the next round to see something.
                 client.put(part, topic.latest.get(part) or self._encode(topic, part))
         return errors
 
@@ -205,6 +206,7 @@ class PageTopics:
     def _open(self, name: str) -> _Topic:
         if len(name) > MAX_TOPIC:
             raise TopicError(f"a topic has {MAX_TOPIC} characters at most")
+        # Each topic is encoded in every period, however few clients want it.
         if len(self._topics) >= _MAX_DISTINCT:
             raise TopicError(f"all clients together have {_MAX_DISTINCT} topics at most")
         if name in {PLANT, EVENTS}:
@@ -253,6 +255,7 @@ class PageTopics:
         now_s, wall_s = monotonic(), time()
         for name, history in self.histories.items():
             shown = self._feed.shown(name, now_s)
+            # A line through stale values would look like measured ones.
             history.add(wall_s, None if shown.is_stale else shown.value)
 
 

@@ -83,8 +83,11 @@ class FieldClient:
         while True:
             began_s = clock()
             reason = await self._connect()
+            # A controller that accepts connections and ends them at once must not be tried in short
+            # pauses.
             if clock() - began_s > _LASTING_S:
                 backoff.reset()
+            # One line for each reason: attempts go on for as long as the controller is off.
             if self._status.is_up or self._status.reason != reason:
                 logger.warning("%s: no connection: %s", self._status.name, reason)
             self._change(reason, is_up=False)
@@ -161,6 +164,8 @@ class FieldClient:
             replies = await connection.talk(connection.link.read(batch))
             for span, reply in zip(batch, replies, strict=True):
                 if isinstance(reply, str):
+                    # One wrong address fails a request for many values: read alone, only that value
+                    # fails.
                     if not plan.split(span):
                         self._note(span.keys[0], reply)
                 else:

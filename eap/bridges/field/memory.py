@@ -59,11 +59,13 @@ class _Area:
         self.longest = max(each.point.type.bits for each in self.points)
         unit = unit_bits(points[0].point.place.area)
         end = max(each.point.end for each in points)
+        # Clients read whole registers and bytes, also where the last variable ends within one.
         self.bits = end + -end % unit
         self.data = bytearray(-(-self.bits // 8))
 
     def covering(self, start: int, bits: int) -> list[ServedPoint]:
         """Return the variables that have bits in a range."""
+        # A variable that begins before that ends before the range.
         first = bisect_left(self.starts, start - self.longest + 1)
         last = bisect_right(self.starts, start + bits - 1)
         return [each for each in self.points[first:last] if each.point.end > start]
@@ -132,6 +134,7 @@ class ServedMemory:
             place, kind = point.place.bit, point.type
             before = get_bits(found.data, place, kind.bits)
             after = get_bits(wanted, place, kind.bits)
+            # What still differs in the end lies in no variable.
             put_bits(rest, place, kind.bits, before)
             if is_writable:
                 # Also one with the same value: somebody else may have set another one meanwhile.

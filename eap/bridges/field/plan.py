@@ -83,9 +83,11 @@ class ReadPlan:
         return tuple(found)
 
     def _joins(self, last: ReadSpan, span: ReadSpan) -> bool:
+        # What failed together stays alone, otherwise it would fail again in the next round.
         if last.area != span.area or not self._alone.isdisjoint(last.keys):
             return False
         end = max(last.start + last.bits, span.start + span.bits)
+        # A few bytes too many cost less than a further request.
         gap = span.start - last.start - last.bits
         return gap <= self._limits.gap_bits(
             span.area

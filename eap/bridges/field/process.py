@@ -60,6 +60,7 @@ async def run_field(
             group.create_task(FieldServing(bridge, server, key, make_session).run())
         else:
             bridge.ready()
+        # Controllers may be away for as long as they like: the bridge is ready without them.
         group.create_task(_follow(bridge, key, controllers, make_link))
 
 
@@ -85,6 +86,7 @@ async def _follow(
                     if rows != known:
                         if running is not None:
                             running.cancel()
+                            # Its connections end first: a controller may allow only a few.
                             await asyncio.wait([running])
                         known = rows
                         running = group.create_task(_run(bridge, key, controllers, rows, make_link))
@@ -130,6 +132,7 @@ async def _run(
         for client in clients.values():
             group.create_task(client.run())
         if targets:
+            # One feed serves all: the fastest controller decides how often it looks.
             period_ms = min(each.every_ms for each in controllers.values())
             group.create_task(bridge.feed(targets, period_ms, on_values=pass_on).run())
 

@@ -106,6 +106,7 @@ class FieldServing:
 
     def _show(self, samples: Mapping[str, Sample]) -> None:
         for name, sample in samples.items():
+            # Clients read the value before, or get the error that there is none yet.
             if not sample.has_value:
                 continue
             self._bridge.status.sent += 1
@@ -122,6 +123,7 @@ class FieldServing:
             return
         host = str(peer[0])
         is_full = self._hosts.total() >= MAX_CLIENTS or self._hosts[host] >= MAX_CLIENTS_OF_HOST
+        # Without an answer: both protocols have none before the first request.
         if is_full:
             self._bridge.status.dropped += 1
             writer.transport.abort()

@@ -79,6 +79,7 @@ class JsonValues:
         on_change: set[str] = set()
         for (patterns, group), is_periodic in zip(self._groups, self._is_periodic, strict=True):
             fits = {name for pattern in patterns for name in match_names(pattern, variables)}
+            # The first entry of the plant file that fits a variable decides.
             names = [name for name in variables if name in fits and name not in published]
             published.update(names)
             group.names = names if is_periodic else ()
@@ -96,6 +97,7 @@ class JsonValues:
         if self._is_connected:
             gone = set(before.values()) - set(self._topics.values())
             if self._retain:
+                # An empty payload has the broker forget a retained message (MQTT 3.1.1, 3.3.1.3).
                 self._first += (Publish(each, b"", 1, is_retained=True) for each in sorted(gone))
             self._first += self._subscriptions()
             self._first += self._discover()
@@ -180,6 +182,7 @@ class JsonValues:
 
     def _subscriptions(self) -> Iterator[Subscribe]:
         topics = list(self._settable)
+        # Brokers limit the size of a packet.
         for first in range(0, len(topics), _SUBSCRIBED_AT_ONCE):
             yield Subscribe(topics[first : first + _SUBSCRIBED_AT_ONCE])
 

@@ -66,6 +66,7 @@ async def serve(bridge: Bridge, spec: MqttBridgeSpec) -> None:
     states = ConnectionStates(bridge, spec.broker)
     for kind, core in cores.items():
         name = section.client_id or f"eap-{level(bridge.instance)}-{level(socket.gethostname())}"
+        # A broker ends the older of two connections with one client ID.
         is_only = section.client_id and len(cores) == 1
         client_id = name if is_only else f"{name}-{kind}"
         broker = replace(spec.broker, client_id=client_id)
@@ -167,6 +168,8 @@ class BrokerConnection:
             await asyncio.sleep(period_s)
 
     def _send(self) -> None:
+        # Values wait in the core, where a newer one replaces them, and not in the queue of the
+        # link.
         room = _ROOM - self._link.waiting
         if room <= 0:
             return
@@ -198,6 +201,7 @@ class BrokerConnection:
             return
         for command in commands:
             try:
+                # The link must not wait: it also keeps the connection alive.
                 self._commands.put_nowait(command)
             except asyncio.QueueFull:
                 status.received += 1

@@ -91,6 +91,7 @@ class SparkplugNode:
         """Return NDEATH of the next connection, whose NBIRTH has the same ``bdSeq``."""
         self._bd_seq = (self._bd_seq + 1) % _SEQUENCES
         metric = Metric("bdSeq", MetricType.INT64, self._bd_seq)
+        # Without a sequence number, which the broker cannot know when it sends the will.
         return Publish(self._topic("NDEATH"), encode_payload(0, [metric], None), 1)
 
     def set_variables(self, variables: Mapping[str, BridgeVariable], now_ns: int) -> None:
@@ -112,6 +113,7 @@ class SparkplugNode:
             group.names = [name for name in names if published[name] == period]
             self._periodic.append(group)
         self._kinds = {name: datatypes.parse(variables[name].type) for name in names}
+        # Aliases are unique within the node: DDATA has them instead of names.
         self._aliases = {name: alias for alias, name in enumerate(names, _REBIRTH_ALIAS + 1)}
         self._by_alias = {alias: name for name, alias in self._aliases.items()}
         self._templates = TemplateTypes()
@@ -206,6 +208,7 @@ class SparkplugNode:
             return self._numbered("DBIRTH", metrics, now_ns, device), len(metrics)
         if not device.waiting:
             return None, 0
+        # A host that was told of the death shows all metrics of the station as stale.
         if is_lost:
             device.is_born = False
             device.waiting.clear()
@@ -244,6 +247,7 @@ class SparkplugNode:
 
     def _command(self, topic: str, station: str, metric: Metric) -> WriteCommand:
         name = f"{station}/{metric.name}"
+        # Hosts may write by the alias of the birth instead of by the name.
         if not metric.name and metric.alias is not None:
             name = self._by_alias.get(metric.alias, "")
         variable = self._variables.get(name)

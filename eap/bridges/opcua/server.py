@@ -99,6 +99,7 @@ def bound_socket(listen: Listen) -> socket.socket:
     family = socket.AF_INET6 if ":" in listen.host else socket.AF_INET
     made = socket.socket(family, socket.SOCK_STREAM)
     try:
+        # Connections of the process before may still be in TIME_WAIT.
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         made.bind((listen.host, listen.port))
     except OSError as exc:
@@ -245,6 +246,7 @@ class PlantOpcUa:
         if not self.may_write(value.NodeId, client.user):
             return ua.StatusCodes.BadUserAccessDenied
         status = value.Value.StatusCode
+        # The plant keeps neither parts of arrays that a client wrote nor a status of its values.
         if value.IndexRange or (status is not None and not status.is_good()):
             return ua.StatusCodes.BadWriteNotSupported
         return None
@@ -279,6 +281,7 @@ class PlantOpcUa:
         answer = await self._bridge.call(REQUEST_STATE, target=station, state=state, origin=origin)
         if answer.error is not None:
             raise ControlError(answer.error.text, code=ErrorCode.REFUSED)
+        # A client that reads the state at once finds the one that it has requested.
         await self._take_status((await self._bridge.request("status"))["stations"])
 
     async def _rescan(self, bus: str, client: Client) -> None:
@@ -302,6 +305,7 @@ class PlantOpcUa:
         section, plant = self._section, self._bridge.plant
         if section.certificate:
             return given_certificate(Path(section.certificate), Path(section.key), plant)
+        # A listener on every address has no host name of its own for the certificate.
         hosts = [] if self._listen.is_any else [self._listen.host]
         return own_certificate(folder, plant, hosts)
 

@@ -120,6 +120,7 @@ class PlantSession(InternalSession):  # type: ignore[misc]
             algorithm = token.EncryptionAlgorithm
             if algorithm and algorithm not in _ENCRYPTIONS:
                 raise refused(ua.StatusCodes.BadIdentityTokenInvalid)
+            # A password in clear goes over no network.
             if not (algorithm or is_encrypted or self.iserver.takes_clear_passwords):
                 raise refused(ua.StatusCodes.BadIdentityTokenRejected)
             try:
@@ -259,6 +260,7 @@ class PlantSession(InternalSession):  # type: ignore[misc]
 
     def _check_own(self, number: int) -> None:
         found = self.subscription_service.subscriptions.get(number)
+        # The numbers of subscriptions are those of the server: a client may guess those of others.
         if self.external and found is not None and found.session_id != self.session_id:
             raise refused(ua.StatusCodes.BadSubscriptionIdInvalid)
 

@@ -119,6 +119,7 @@ class AuditFile:
         try:
             return os.open(self.path, _FLAGS, 0o640)
         except FileNotFoundError:
+            # The folder may be removed while the plant runs.
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             return os.open(self.path, _FLAGS, 0o640)
 
