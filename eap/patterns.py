@@ -25,6 +25,14 @@ def compile_patterns(patterns: Iterable[str], character: str = ".") -> Callable[
     return lambda name: found.fullmatch(name) is not None
 
 
+def match_names(pattern: str, names: Iterable[str]) -> list[str]:
+    """Return the *names* that fit *pattern*; ``*`` stands for any text without slashes."""
+    if "*" not in pattern:
+        return [name for name in names if name == pattern]
+    fits = compile_patterns([pattern], "[^/]")
+    return [name for name in names if fits(name)]
+
+
 def _expression(pattern: str, character: str) -> str:
     first, *others = (_piece(each, character) for each in pattern.split("*"))
     if not others:

@@ -8,7 +8,8 @@ from time import time
 from typing import Any, Literal
 
 from eap.ams.spec import Role
-from eap.bridges.feed import BridgeFeed, Sample
+from eap.bridges.feed import BridgeFeed
+from eap.bridges.values import Sample
 from eap.control.protocol import WRITE, AnswerT, Method, ParametersT, WriteOrigin
 from eap.errors import EapError
 from eap.live.client import LiveClient

@@ -45,10 +45,11 @@ from eap.config.finding import FindingReport, one_of
 from eap.config.index import Index
 from eap.config.listen import parse_listen
 from eap.config.ports import check_names
-from eap.config.selection import VariableNames, match_names, reason_not_settable
+from eap.config.selection import VariableNames, reason_not_settable
 from eap.config.structs import StationSection
 from eap.config.variables import named_part
 from eap.ids import parse_host
+from eap.patterns import match_names
 from eap.pd.spec import FieldSource, S7Source, S7Target, Source, Target
 from eap.suggest import suggest
 

@@ -13,8 +13,9 @@ from eap.config.bridge_sections import MqttBridgeSpec, MqttSection
 from eap.config.brokers import URL, broker_spec, brokers_of, check_credentials, parse_url
 from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
-from eap.config.selection import VariableNames, match_names, reason_not_settable
+from eap.config.selection import VariableNames, reason_not_settable
 from eap.config.structs import RouteSection, StationSection
+from eap.patterns import match_names
 from eap.suggest import suggest
 
 _PLACEHOLDER = re.compile(r"\{[^{}]*\}")

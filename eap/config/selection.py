@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 from eap.codec.datatypes import variable_of
 from eap.config.finding import FindingReport, one_beside, one_of
 from eap.config.index import Index
 from eap.config.structs import StationSection
-from eap.patterns import compile_patterns
+from eap.patterns import match_names
 from eap.pd.rules import MADE_SUFFIXES
 from eap.suggest import suggest
 
 _OF = "STATION/VARIABLE, with * for any text"
-
-
-def match_names(pattern: str, names: Iterable[str]) -> list[str]:
-    """Return the *names* that fit *pattern*; ``*`` stands for any text without slashes."""
-    if "*" not in pattern:
-        return [name for name in names if name == pattern]
-    fits = compile_patterns([pattern], "[^/]")
-    return [name for name in names if fits(name)]
 
 
 class VariableNames:

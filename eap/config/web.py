@@ -17,7 +17,7 @@ from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
 from eap.config.listen import parse_listen
 from eap.config.pictures import read_picture
-from eap.config.selection import VariableNames, match_names, reason_not_settable
+from eap.config.selection import VariableNames, reason_not_settable
 from eap.config.structs import StationSection
 from eap.config.users import check_users
 from eap.config.web_sections import (
@@ -39,6 +39,7 @@ from eap.config.web_sections import (
     WebSection,
 )
 from eap.ids import parse_host
+from eap.patterns import match_names
 from eap.pd.spec import PortKind
 from eap.suggest import suggest
 

@@ -14,12 +14,12 @@ from aiohttp import web
 from devicebus.errors import BusError
 from eap.ams.spec import Role
 from eap.config.pictures import read_picture
-from eap.config.selection import match_names
 from eap.config.web import default_pages, window_s
 from eap.config.web_sections import CommentRule, PicturePanel, SetPanel, WebPage, WebSection
 from eap.control.protocol import ErrorCode, WriteOrigin
 from eap.errors import ControlError
 from eap.ids import encode_value
+from eap.patterns import match_names
 from eap.release import RELEASE
 from eap.runtime.logins import Principal
 from eap.web.feed import UNKNOWN, PlantFeed, ShownValue

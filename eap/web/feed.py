@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import msgspec
 
 from eap.codec.datatypes import variable_of
-from eap.config.selection import match_names
 from eap.config.web import STATE
 from eap.control.protocol import (
     PD_LIST,
@@ -36,6 +35,7 @@ from eap.live.findings import Severity, is_hung
 from eap.live.rows import pd_flows, station_rows
 from eap.live.transport import ValuesSubscription
 from eap.live.view import LiveReport, LiveView
+from eap.patterns import match_names
 from eap.pd.quality import QUALITY_MAX, QUALITY_NS
 from eap.pd.spec import Writer
 from eap.suggest import suggest

@@ -10,12 +10,12 @@ from time import time
 from typing import Literal, TypeVar
 
 from eap.bridges.bridge import Bridge
-from eap.bridges.feed import Sample
 from eap.bridges.field.client import ControllerPoints, FieldClient
 from eap.bridges.field.memory import ServedMemory
 from eap.bridges.field.plan import PointKey
 from eap.bridges.field.protocol import FieldLink, FieldSession
 from eap.bridges.field.server import FieldServing
+from eap.bridges.values import Sample
 from eap.codec import datatypes
 from eap.codec.fieldaddresses import FieldPoint
 from eap.config.bridge_sections import FieldServer, ModbusController, S7Controller

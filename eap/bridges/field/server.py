@@ -12,9 +12,9 @@ from ipaddress import ip_address
 from typing import Any, Literal
 
 from eap.bridges.bridge import Bridge
-from eap.bridges.feed import Sample
 from eap.bridges.field.memory import ServedMemory, ServedPoint
 from eap.bridges.field.protocol import FieldSession
+from eap.bridges.values import Sample
 from eap.config.bridge_sections import FieldServer
 from eap.config.field import served_point
 from eap.config.listen import parse_listen

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from eap.ams.mqtt.network import Publish
-from eap.bridges.feed import BridgeVariable
+from eap.bridges.values import BridgeVariable
 from eap.codec import datatypes
 from eap.codec.basetypes import Boolean, DataType, Integer, Real
 from eap.codec.enumerations import Enumeration

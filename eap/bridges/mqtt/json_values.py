@@ -8,7 +8,6 @@ from typing import Any
 import msgspec
 
 from eap.ams.mqtt.network import Publish, Subscribe
-from eap.bridges.feed import BridgeVariable, Sample
 from eap.bridges.mqtt.home_assistant import DiscoveryDocuments
 from eap.bridges.mqtt.topics import (
     MAX_PAYLOAD,
@@ -20,11 +19,12 @@ from eap.bridges.mqtt.topics import (
     WriteCommand,
     level,
 )
+from eap.bridges.values import BridgeVariable, Sample
 from eap.codec import datatypes
 from eap.codec.enumerations import Enumeration
 from eap.codec.structures import Structure
 from eap.config.bridge_sections import MqttSection
-from eap.config.selection import match_names
+from eap.patterns import match_names
 
 ONLINE, OFFLINE = b"online", b"offline"
 _SET, _RESULT = "/set", "/result"

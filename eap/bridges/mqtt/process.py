@@ -13,11 +13,12 @@ from msgspec.structs import replace
 
 from eap.ams.spec import MqttSpec
 from eap.bridges.bridge import Bridge
-from eap.bridges.feed import BridgeFeed, Sample
+from eap.bridges.feed import BridgeFeed
 from eap.bridges.mqtt.json_values import JsonValues
 from eap.bridges.mqtt.sparkplug_node import SparkplugNode
 from eap.bridges.mqtt.topics import CommandError, MessageCore, WriteCommand, level
 from eap.bridges.process import run_bridge
+from eap.bridges.values import Sample
 from eap.config.bridge_sections import MqttBridgeSpec
 from eap.errors import EapError
 from eap.net.mqtt import Handlers, MqttLink

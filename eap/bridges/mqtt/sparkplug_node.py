@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from eap.ams.mqtt.network import Publish, Subscribe
-from eap.bridges.feed import BridgeVariable, Quality, Sample
 from eap.bridges.mqtt.sparkplug_types import TemplateTypes, metric_type, plain_value
 from eap.bridges.mqtt.topics import (
     MAX_PAYLOAD,
@@ -21,12 +20,13 @@ from eap.bridges.mqtt.topics import (
     WriteCommand,
     level,
 )
+from eap.bridges.values import BridgeVariable, Quality, Sample
 from eap.codec import datatypes
 from eap.codec.basetypes import DataType
 from eap.codec.sparkplug import Metric, MetricType, decode_payload, encode_payload
 from eap.config.bridge_sections import MqttSection, SparkplugSection
-from eap.config.selection import match_names
 from eap.errors import CodecError
+from eap.patterns import match_names
 
 REBIRTH = "Node Control/Rebirth"
 QUALITIES = {Quality.GOOD: 192, Quality.STALE: 500, Quality.BAD: 0}

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from eap.ams.mqtt.network import Publish, Subscribe
-from eap.bridges.feed import BridgeVariable, Sample
+from eap.bridges.values import BridgeVariable, Sample
 from eap.errors import EapError
 
 Outgoing: TypeAlias = Publish | Subscribe

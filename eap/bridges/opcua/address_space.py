@@ -16,7 +16,6 @@ from asyncua import ua
 from asyncua.server.address_space import AttributeValue, NodeData
 from asyncua.server.internal_server import InternalServer
 
-from eap.bridges.feed import Quality, Sample
 from eap.bridges.opcua.nodes import (
     NET_ID,
     MethodNode,
@@ -29,6 +28,7 @@ from eap.bridges.opcua.nodes import (
 )
 from eap.bridges.opcua.units import NAMESPACE, unit_id
 from eap.bridges.opcua.values import MISMATCH, BuiltIn, Definition, UaType, converter
+from eap.bridges.values import Quality, Sample
 from eap.config.web import STATE
 
 READ = ua.AccessLevel.CurrentRead.mask

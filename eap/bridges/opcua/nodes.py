@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import NamedTuple, TypeAlias
 
-from eap.bridges.feed import BridgeVariable
 from eap.bridges.opcua.values import Definition, UaType, converter, definitions_of
+from eap.bridges.values import BridgeVariable
 from eap.codec import datatypes
 from eap.codec.basetypes import DataType, Integer
 from eap.codec.datatypes import parts_of

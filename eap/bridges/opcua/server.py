@@ -17,7 +17,6 @@ from asyncua.server.event_generator import EventGenerator
 
 from eap.ams.spec import Role
 from eap.bridges.bridge import Bridge
-from eap.bridges.feed import Sample
 from eap.bridges.opcua.address_space import PlantAddressSpace, taken_value
 from eap.bridges.opcua.certificates import (
     OwnCertificate,
@@ -27,17 +26,18 @@ from eap.bridges.opcua.certificates import (
 )
 from eap.bridges.opcua.nodes import STATES, MethodNode, StationFacts, VariableNode, plan_nodes
 from eap.bridges.opcua.sessions import Client, PlantListener, PlantServer, TrustingPolicy
+from eap.bridges.values import Sample
 from eap.codec.ads import AdsError, AdsRange, IndexGroup, SdoOffset
 from eap.codec.ams import AmsCommand
 from eap.config.listen import Listen, parse_listen, role_of_anonymous
 from eap.config.opcua import channel_securities
 from eap.config.opcua_sections import ChannelSecurity, ClientTrust, OpcUaSection
-from eap.config.selection import match_names
 from eap.control.device import REQUEST_STATE
 from eap.control.logins import NOTE_LOGINS
 from eap.control.protocol import ErrorCode, WriteOrigin
 from eap.control.routes import AMS_ASK
 from eap.errors import ControlError, EapError, EnvironmentalError
+from eap.patterns import match_names
 from eap.release import RELEASE
 from eap.runtime.logins import LoginRefusals, Logins, Principal
 from eap.runtime.store import plant_folder

@@ -28,7 +28,6 @@ from devicebus.errors import BusError
 from eap.ads.request import AdsRefusedError, parse_request
 from eap.ams.access import service_of
 from eap.ams.spec import AccessService, Role
-from eap.config.selection import match_names
 from eap.config.users import PlantUserSection
 from eap.control.bus import BUS_METHODS, BusOpenParameters
 from eap.control.protocol import (
@@ -54,6 +53,7 @@ from eap.control.protocol import (
 from eap.errors import ControlError, EapError, ImageError
 from eap.net.limits import Activity, ListenerLimits
 from eap.od.abort import SdoAbortError
+from eap.patterns import match_names
 from eap.runtime.bus_errors import to_record
 from eap.runtime.logins import Principal
 from eap.services.control.audit import change_of, error_in_result

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from eap.bridges.feed import BridgeVariable, Quality, Sample
 from eap.bridges.mqtt.json_values import JsonValues
 from eap.bridges.mqtt.sparkplug_node import SparkplugNode
 from eap.bridges.mqtt.topics import CommandError, MessageCore
+from eap.bridges.values import BridgeVariable, Quality, Sample
 from eap.codec import datatypes
 from eap.codec.sparkplug import (
     DataSet,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
-from eap.bridges.feed import BridgeFeed, Quality, Sample, select
+from eap.bridges.feed import BridgeFeed
+from eap.bridges.values import Quality, Sample, select
 from eap.control.protocol import ErrorCode, ValuesEvent, VariableRow
 from eap.errors import ControlError
 from eap.live.client import LiveClient

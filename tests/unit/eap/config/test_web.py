@@ -11,9 +11,9 @@ from eap.ams.spec import Role
 from eap.config.index import ExpectedBus
 from eap.config.listen import parse_listen, role_of_anonymous
 from eap.config.load import PlantResult, load
-from eap.config.selection import match_names
 from eap.config.web import window_s
 from eap.config.web_sections import WebSection
+from eap.patterns import match_names
 from tests.support.webplant import HASH
 
 PLANT = """\

@@ -8,9 +8,9 @@ import msgspec
 import pytest
 
 from eap.ams.mqtt.network import Publish, Subscribe
-from eap.bridges.feed import BridgeVariable, Quality, Sample
 from eap.bridges.mqtt.json_values import JsonValues
 from eap.bridges.mqtt.topics import CommandError, WriteCommand
+from eap.bridges.values import BridgeVariable, Quality, Sample
 from eap.config.bridge_sections import MqttPublish, MqttSection
 
 AT_NS = 1_700_000_000_123_400_000

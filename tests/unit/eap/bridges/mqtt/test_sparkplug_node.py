@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from eap.ams.mqtt.network import Publish, Subscribe
-from eap.bridges.feed import BridgeVariable, Quality, Sample
 from eap.bridges.mqtt.sparkplug_node import REBIRTH, SparkplugNode
 from eap.bridges.mqtt.sparkplug_types import TemplateTypes, metric_type, plain_value
 from eap.bridges.mqtt.topics import CommandError
+from eap.bridges.values import BridgeVariable, Quality, Sample
 from eap.codec import datatypes
 from eap.codec.sparkplug import (
     DataSet,

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from eap.bridges.feed import BridgeVariable
 from eap.bridges.opcua.nodes import (
     MethodNode,
     ObjectNode,
@@ -9,6 +8,7 @@ from eap.bridges.opcua.nodes import (
     compare,
     plan_nodes,
 )
+from eap.bridges.values import BridgeVariable
 
 STATION = StationFacts("press", "5.1.1.1.1.1", ("bus0",))
 AXIS = "ST_Axis<24/8:position@0 LREAL,speed@8 INT(-10..10),end@12 ST_End<8/4:x@0 REAL,y@4 REAL>>"
