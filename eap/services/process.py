@@ -27,6 +27,7 @@ from eap.control.protocol import WriteOrigin
 from eap.device.eap_dictionary import DeviceIdentity
 from eap.errors import ConfigError, EapError, EnvironmentalError, ImageError
 from eap.net import realtime
+from eap.net.busypoll import BusyPollLoop
 from eap.net.image_file import StationImage
 from eap.pd.device import DeviceState
 from eap.pd.handover import PortChanges
@@ -566,8 +567,8 @@ def main(handover_fd: int, startup: Startup) -> int:
     log = LimitedLogHandler()
     start_logging("services", log)
     try:
-        with ExitStack() as resources:
-            asyncio.run(Services(handover, startup, log, resources).run())
+        with ExitStack() as resources, asyncio.Runner(loop_factory=BusyPollLoop) as runner:
+            runner.run(Services(handover, startup, log, resources).run())
     except EapError as exc:
         sys.stderr.write(f"services: {exc}\n")
         return 2 if isinstance(exc, (ConfigError, EnvironmentalError)) else 1

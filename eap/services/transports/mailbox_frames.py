@@ -32,24 +32,12 @@ from eap.codec.mailbox import (
 from eap.codec.wire import Buffer
 from eap.errors import CodecError, MalformedError
 from eap.ids import EAP_MULTICAST_MAC, MacAddr, NetId
+from eap.net.busypoll import BusyPollLoop
 from eap.pd.link import FrameChannel, FrameOrigin, OutFrame
 from eap.runtime.drop_counters import DropCounters, DropReason
 from eap.services.transports.demultiplexer import Demultiplexer
 
 _MAILBOX = FrameType.MAILBOX.value  # a plain number: members of enums are slow
-
-
-QUICK_NS = 120_000
-"""Frames that come within this time after the last answer are quick."""
-SPIN_LIMIT_NS = 60_000
-"""Time limit of one busy-poll for the next frame."""
-MAX_SPIN_FRAMES = 32
-"""Limit of the frames in one busy-poll, because other tasks wait for the loop."""
-# A quick sender may have been interrupted.
-MAX_FRUITLESS = 2
-"""Fruitless polls in a row before backing off."""
-MAX_BACKOFF = 1024
-"""Most frames without busy-polling after many fruitless polls."""
 
 
 class DrainedChannel(Protocol):
@@ -104,13 +92,6 @@ class FrameIntake:
                 self._counters.count(station, reason)
 
 
-def watch_channel(channel: DrainedChannel) -> None:
-    """Drain *channel* now and whenever something arrives, as long as the running loop lives."""
-    patient = BusyPoller(channel)
-    asyncio.get_running_loop().add_reader(channel.fileno(), patient.drain)
-    patient.drain()
-
-
 class WithDescriptor(Protocol):
     """Object with a descriptor."""
 
@@ -118,67 +99,24 @@ class WithDescriptor(Protocol):
         """Return the descriptor."""
 
 
+def watch_channel(channel: DrainedChannel) -> None:
+    """Drain *channel* now and whenever something arrives, as long as the running loop lives."""
+
+    def drain() -> None:
+        channel.drain(monotonic_ns())
+
+    loop = asyncio.get_running_loop()
+    watch = loop.watch if isinstance(loop, BusyPollLoop) else loop.add_reader
+    watch(channel.fileno(), drain)
+    drain()
+
+
 def stop_watching(channel: WithDescriptor) -> None:
     """Drain *channel* no more, which is closed next; the loop may have ended."""
     with suppress(RuntimeError):
-        asyncio.get_running_loop().remove_reader(channel.fileno())
-
-
-class BusyPoller:
-    """Drains a channel, and busy-polls it for a while where the next frame is probably near.
-
-    A client that waits for each answer sends the next request at once.  It is there sooner than a
-    process can sleep, be woken and run an event loop, which takes as long as the answer itself.  So
-    while frames come that quickly the channel is polled, for some microseconds after each and for
-    some frames in all, because other tasks wait for the loop.
-
-    A sender on the same processor cannot run during a poll.  So each fruitless poll doubles the
-    number of frames without polling.
-
-    Args:
-        channel: Channel to drain.
-        clock: The monotonic clock, in nanoseconds.
-    """
-
-    def __init__(self, channel: DrainedChannel, clock: Callable[[], int] = monotonic_ns) -> None:
-        self._channel = channel
-        self._clock = clock
-        self._handled_ns = clock() - QUICK_NS
-        self._retries = 0
-        self._skipped = 0
-        self._backoff = 1
-
-    def drain(self) -> None:
-        """Handle the waiting frames; poll for more if they came soon after the last answer."""
-        channel, clock = self._channel, self._clock
-        now_ns = clock()
-        is_quick = now_ns - self._handled_ns < QUICK_NS
-        taken = channel.drain(now_ns)
-        self._handled_ns = now_ns = clock()
-        if self._skipped:
-            self._skipped -= 1
-        elif is_quick or self._retries:
-            self._watch(taken, now_ns)
-
-    def _watch(self, taken: int, now_ns: int) -> None:
-        """Poll for more after *taken* frames."""
-        channel, clock = self._channel, self._clock
-        while taken < MAX_SPIN_FRAMES:
-            if now_ns - self._handled_ns > SPIN_LIMIT_NS:
-                self._note_fruitless()
-                return
-            found = channel.drain(now_ns)
-            now_ns = clock()
-            if found:
-                taken += found
-                self._handled_ns, self._retries, self._backoff = now_ns, MAX_FRUITLESS, 1
-
-    def _note_fruitless(self) -> None:
-        """Back off after a fruitless poll, unless the sender was quick until now."""
-        if self._retries:
-            self._retries -= 1
-        else:
-            self._skipped, self._backoff = self._backoff, min(2 * self._backoff, MAX_BACKOFF)
+        loop = asyncio.get_running_loop()
+        unwatch = loop.unwatch if isinstance(loop, BusyPollLoop) else loop.remove_reader
+        unwatch(channel.fileno())
 
 
 FRAME_OVERHEAD = EtherCatHeader.SIZE + MailboxHeader.SIZE

@@ -1,0 +1,284 @@
+"""Event loop that polls before it sleeps: when, for how long, and functions of descriptors."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import socket
+from collections.abc import Iterator
+from selectors import EVENT_READ, EpollSelector
+
+import pytest
+
+from eap.net.busypoll import (
+    MAX_BACKOFF,
+    MAX_FRUITLESS,
+    MAX_ROUNDS,
+    QUICK_NS,
+    SPIN_LIMIT_NS,
+    BusyPollLoop,
+    BusyPollSelector,
+    Event,
+)
+
+SOON_S = 0.0005
+
+
+class Line:
+    """A socket to which bytes come at given times; reading the clock takes a microsecond."""
+
+    def __init__(self, *arrivals_ns: int) -> None:
+        self.near, self.far = socket.socketpair()
+        self.arrivals_ns = list(arrivals_ns)
+        self.now_ns = 0
+        self.looks = 0
+        self.errors: list[Exception] = []
+        self.selector = BusyPollSelector(self.errors.append, self.clock)
+        self.selector.register(self.near, EVENT_READ, ("reader", None))
+
+    def clock(self) -> int:
+        self.looks += 1
+        self.now_ns += 1000
+        while self.arrivals_ns and self.arrivals_ns[0] <= self.now_ns:
+            del self.arrivals_ns[0]
+            self.far.send(b"x")
+        return self.now_ns
+
+    def wait(self) -> bool:
+        """Return whether something came."""
+        self.looks = 0
+        found = self.selector.select(SOON_S)
+        if found:
+            self.near.recv(100)
+        return bool(found)
+
+    @property
+    def has_polled(self) -> bool:
+        return self.looks > 3
+
+    def close(self) -> None:
+        self.selector.close()
+        self.near.close()
+        self.far.close()
+
+
+@pytest.fixture
+def line() -> Iterator[Line]:
+    line = Line()
+    yield line
+    line.close()
+
+
+def send_now(line: Line) -> None:
+    line.far.send(b"x")
+
+
+def test_selector_never_polls_after_rare_events(line, monkeypatch):
+    def sleep(selector: EpollSelector, timeout: float | None) -> list[Event]:
+        line.now_ns += QUICK_NS
+        return found(selector, 0)
+
+    found = EpollSelector.select
+    monkeypatch.setattr(EpollSelector, "select", sleep)
+    for _ in range(3):
+        send_now(line)
+        assert line.wait()
+        assert not line.has_polled
+
+
+def test_selector_polls_after_a_quick_event(line):
+    send_now(line)
+    assert line.wait()
+    assert not line.has_polled
+    line.arrivals_ns = [line.now_ns + SPIN_LIMIT_NS // 2]
+    assert line.wait()
+    assert line.has_polled
+
+
+def test_selector_polls_no_longer_than_its_limit(line):
+    send_now(line)
+    line.wait()
+    begin_ns = line.now_ns
+    assert not line.wait()
+    assert SPIN_LIMIT_NS <= line.now_ns - begin_ns < SPIN_LIMIT_NS + 5000
+
+
+def test_selector_polls_no_longer_than_the_timeout(line):
+    send_now(line)
+    line.wait()
+    line.looks = 0
+    line.selector.select(0.000_01)
+    assert 2 < line.looks < 20
+
+
+def test_selector_with_timeout_zero_does_not_poll(line):
+    send_now(line)
+    line.wait()
+    line.looks = 0
+    assert line.selector.select(0) == []
+    assert line.looks == 0
+
+
+def test_selector_backs_off_after_fruitless_polls(line, monkeypatch):
+    monkeypatch.setattr(EpollSelector, "select", lambda self, timeout: [])
+    polled = []
+    for _ in range(4 * MAX_BACKOFF):
+        line.selector._is_quick = True
+        line.wait()
+        polled.append(line.has_polled)
+    fruitless = [number for number, was in enumerate(polled) if was]
+    rests = [after - before - 1 for before, after in itertools.pairwise(fruitless)]
+    assert rests[:4] == [1, 2, 4, 8]
+    assert max(rests) == MAX_BACKOFF
+
+
+def test_selector_resets_its_backoff_after_a_fruitful_poll(line):
+    line.selector._backoff = MAX_BACKOFF
+    line.selector._is_quick = True
+    line.arrivals_ns = [line.now_ns + SPIN_LIMIT_NS // 2]
+    assert line.wait()
+    assert line.selector._backoff == 1
+    polled = []
+    for _ in range(MAX_FRUITLESS + 1):
+        line.selector._is_quick = False
+        line.wait()
+        polled.append(line.has_polled)
+    assert polled == [True] * MAX_FRUITLESS + [False], "a quick sender may have been interrupted"
+
+
+def test_selector_handles_descriptors_with_functions_inside(line):
+    calls = []
+
+    def handle() -> None:
+        calls.append(line.near.recv(100))
+
+    line.selector.modify(line.near, EVENT_READ, handle)
+    send_now(line)
+    assert line.selector.select(1) == []
+    assert calls == [b"x"]
+    with_other, other = socket.socketpair()
+    with with_other, other:
+        line.selector.register(with_other, EVENT_READ, ("reader", None))
+        send_now(line)
+        other.send(b"y")
+        assert [key.fileobj for key, _ in line.selector.select(1)] == [with_other]
+        assert calls == [b"x", b"x"]
+
+
+def test_selector_goes_on_polling_after_events_that_functions_handled(line):
+    line.selector.modify(line.near, EVENT_READ, lambda: line.near.recv(1))
+    send_now(line)
+    half_ns = SPIN_LIMIT_NS // 2
+    line.arrivals_ns = [half_ns, 2 * half_ns, 3 * half_ns]
+    assert line.selector.select(1) == []
+    assert not line.arrivals_ns, "in one call"
+    assert line.now_ns > 3 * half_ns + SPIN_LIMIT_NS
+
+
+def test_selector_returns_when_a_function_gave_the_loop_work(line):
+    def handle() -> None:
+        line.near.recv(1)
+        line.selector.has_work = True
+
+    line.selector.modify(line.near, EVENT_READ, handle)
+    send_now(line)
+    line.arrivals_ns = [SPIN_LIMIT_NS // 2]
+    assert line.selector.select(1) == []
+    assert line.arrivals_ns
+
+
+def test_selector_returns_at_its_timeout_however_much_comes(line):
+    line.selector.modify(line.near, EVENT_READ, lambda: line.near.recv(1))
+    send_now(line)
+    line.arrivals_ns = list(range(0, 1_000_000, 5000))
+    line.selector.select(0.0001)
+    assert line.now_ns < 110_000
+
+
+def test_selector_limits_the_events_without_the_loop(line):
+    line.selector.modify(line.near, EVENT_READ, lambda: line.near.recv(1))
+    send_now(line)
+    line.arrivals_ns = list(range(0, 1_000_000_000, 1000))
+    left = len(line.arrivals_ns)
+    line.selector.select(1)
+    assert left - len(line.arrivals_ns) < 10 * MAX_ROUNDS
+
+
+def test_selector_reports_the_error_of_a_function_and_goes_on(line):
+    def fail() -> None:
+        line.near.recv(100)
+        raise ValueError("broken")
+
+    line.selector.modify(line.near, EVENT_READ, fail)
+    send_now(line)
+    assert line.selector.select(1) == []
+    assert [str(each) for each in line.errors] == ["broken"]
+
+
+def test_loop_calls_a_watcher_until_it_is_removed():
+    async def serve() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, BusyPollLoop)
+        received: asyncio.Queue[bytes] = asyncio.Queue()
+        loop.watch(near.fileno(), lambda: received.put_nowait(near.recv(1)))
+        for octet in (b"a", b"b"):
+            far.send(octet)
+            assert await received.get() == octet
+        loop.unwatch(near.fileno())
+        loop.unwatch(near.fileno())
+        far.send(b"c")
+        await asyncio.sleep(0.001)
+        assert received.empty()
+
+    near, far = socket.socketpair()
+    with near, far, asyncio.Runner(loop_factory=BusyPollLoop) as runner:
+        runner.run(serve())
+
+
+def test_loop_hands_the_error_of_a_watcher_to_its_exception_handler():
+    async def serve() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, BusyPollLoop)
+        found: asyncio.Queue[dict[str, object]] = asyncio.Queue()
+        loop.set_exception_handler(lambda _, context: found.put_nowait(context))
+
+        def fail() -> None:
+            near.recv(1)
+            raise ValueError("broken")
+
+        loop.watch(near.fileno(), fail)
+        far.send(b"a")
+        context = await found.get()
+        assert str(context["exception"]) == "broken"
+
+    near, far = socket.socketpair()
+    with near, far, asyncio.Runner(loop_factory=BusyPollLoop) as runner:
+        runner.run(serve())
+
+
+def test_loop_runs_what_a_watcher_scheduled_at_once():
+    async def serve() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, BusyPollLoop)
+        done = loop.create_future()
+        later = loop.create_future()
+
+        def begin() -> None:
+            near.recv(1)
+            loop.call_soon(done.set_result, None)
+            loop.call_later(0.001, later.set_result, None)
+
+        loop.watch(near.fileno(), begin)
+        far.send(b"a")
+        async with asyncio.timeout(20):
+            await asyncio.gather(done, later)
+
+    near, far = socket.socketpair()
+    with near, far, asyncio.Runner(loop_factory=BusyPollLoop) as runner:
+        runner.run(serve())
+
+
+def test_loop_that_is_closed_has_no_watchers():
+    loop = BusyPollLoop()
+    loop.close()
+    loop.unwatch(0)
