@@ -237,8 +237,8 @@ class Forwarder:
     ) -> list[Action]:
         """Return the immediate answer of a service."""
         packet = response_to(header, answer)
-        self._record.connections.of(endpoint, now_ns).add_answer(len(packet), took_ns)
-        self._record.add(Trace(now_ns, _ANSWERED, endpoint, None, header, 0, took_ns, ""))
+        trace = Trace(now_ns, _ANSWERED, endpoint, None, header, 0, took_ns, "")
+        self._record.add_answered(trace, endpoint, None, len(packet))
         return [self._transports.reply(endpoint, packet)]
 
     def answer(self, ticket: int, answer: AmsAnswer, now_ns: int) -> list[Action]:
@@ -400,7 +400,10 @@ class Forwarder:
         if route is not None:
             allowed = route.timeout_ns or allowed
             self._record.routes.of(route.key, now_ns).add_request(len(data))
-        pending = Pending(invoke_id, header, endpoint, route, onward, now_ns, now_ns + allowed)
+        pending = Pending(
+            invoke_id, header, endpoint, route, onward, now_ns, now_ns + allowed,
+            may_repeat=self.admission.may_repeat(endpoint),
+        )  # fmt: skip
         pending.authorized = authorized
         self.in_flight.add(pending)
         return pending
@@ -445,28 +448,29 @@ class Forwarder:
         self, pending: Pending, endpoint: Endpoint, packet: bytes, error_code: int, now_ns: int,
         why: str = "",
     ) -> list[Action]:  # fmt: skip
-        route = pending.route
+        route, header = pending.route, pending.header
         took_ns = now_ns - pending.at_ns
-        hop = None
+        hop = None if route is None else route.hop
+        if not (error_code or why):
+            trace = Trace(now_ns, _ANSWERED, endpoint, hop, header, 0, took_ns, "")
+            key = None if route is None else route.key
+            self._record.add_answered(trace, endpoint, key, len(packet))
+            return [self._transports.reply(endpoint, packet)]
         if error_code and not why:
             why = f"{AdsError.words_of(error_code)} from a service of this station"
-        text = f"{describe(pending.header, endpoint)}: {why}" if why else ""
         if route is not None:
-            hop = route.hop
             traffic = self._record.routes.of(route.key, now_ns)
             if error_code:
                 error = AdsError.words_of(error_code)
                 why = f"{error} from {self._table.describe_hop(route)} or from behind it"
-                text = f"{describe(pending.header, endpoint)}: {why}"
                 traffic.add_error(why, now_ns)
             traffic.add_answer(len(packet), took_ns)
+        text = f"{describe(header, endpoint)}: {why}"
         connection = self._record.connections.of(endpoint, now_ns)
         if error_code:
             connection.add_error(text, now_ns)
         connection.add_answer(len(packet), took_ns)
-        self._record.add(
-            Trace(now_ns, _ANSWERED, endpoint, hop, pending.header, error_code, took_ns, text)
-        )
+        self._record.add(Trace(now_ns, _ANSWERED, endpoint, hop, header, error_code, took_ns, text))
         return [self._transports.reply(endpoint, packet)]
 
     def _fail(self, pending: Pending, text: str, now_ns: int) -> list[Action]:

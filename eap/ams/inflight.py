@@ -96,6 +96,7 @@ class Pending:
         handles: Number of notifications that it requests.
         request_body: Its body, if this router restores a subscription by it later.
         step: Step of a restoration, for a request of this router; None for a client's.
+        may_repeat: Whether the same request may come twice: not by a stream.
         authorized: Decisions on its operations, where its answer has to be completed or audited.
     """
 
@@ -107,6 +108,7 @@ class Pending:
         "handles",
         "header",
         "invoke_id",
+        "may_repeat",
         "onward",
         "request_body",
         "route",
@@ -115,7 +117,7 @@ class Pending:
 
     def __init__(
         self, invoke_id: int, header: AmsHeader, endpoint: Endpoint | None, route: Route | None,
-        onward: bytes, at_ns: int, deadline_ns: int,
+        onward: bytes, at_ns: int, deadline_ns: int, *, may_repeat: bool = False,
     ) -> None:  # fmt: skip
         self.invoke_id = invoke_id
         self.header = header
@@ -127,6 +129,7 @@ class Pending:
         self.handles = 0
         self.request_body = b""
         self.step: object | None = None
+        self.may_repeat = may_repeat
         self.authorized: AuthorizedRequest | None = None
 
 
@@ -140,7 +143,7 @@ class InFlight:
         self._by_id: dict[int, Pending] = {}
         self._by_endpoint: dict[Endpoint, dict[int, Pending]] = {}
         self._by_transport: dict[str, int] = {}
-        self._by_time: dict[int, OrderedDict[int, Pending]] = {}
+        self._by_time: dict[int, dict[int, Pending]] = {}
         self._asked: dict[tuple[Endpoint, bytes, int], int] = {}
         self._abandoned: OrderedDict[int, None] = OrderedDict()
 
@@ -179,12 +182,16 @@ class InFlight:
             self._by_transport[endpoint.transport] = (
                 self._by_transport.get(endpoint.transport, 0) + 1
             )
-            self._asked[endpoint, pending.onward, pending.header.invoke_id] = key
+            if pending.may_repeat:
+                self._asked[endpoint, pending.onward, pending.header.invoke_id] = key
         elif pending.step is None:
             self._abandoned[key] = None
         # The times allowed are few, so that each has its requests in the order of their deadlines.
         allowed = pending.deadline_ns - pending.at_ns
-        self._by_time.setdefault(allowed, OrderedDict())[key] = pending
+        waiting = self._by_time.get(allowed)
+        if waiting is None:
+            waiting = self._by_time[allowed] = {}
+        waiting[key] = pending
 
     def has_request(self, endpoint: Endpoint, onward: bytes, invoke_id: int) -> bool:
         """Return whether a request with these addresses and this ID of its client waits."""
@@ -197,11 +204,7 @@ class InFlight:
             return None
         self._detach(pending)
         self._abandoned.pop(invoke_id, None)
-        allowed = pending.deadline_ns - pending.at_ns
-        waiting = self._by_time[allowed]
-        del waiting[invoke_id]
-        if not waiting:
-            del self._by_time[allowed]
+        del self._by_time[pending.deadline_ns - pending.at_ns][invoke_id]
         return pending
 
     def abandon(self, endpoint: Endpoint) -> list[Pending]:
@@ -233,7 +236,7 @@ class InFlight:
 
     def next_timeout(self) -> int | None:
         """Return the earliest deadline."""
-        heads = (next(iter(each.values())).deadline_ns for each in self._by_time.values())
+        heads = (next(iter(each.values())).deadline_ns for each in self._by_time.values() if each)
         return min(heads, default=None)
 
     def due(self, now_ns: int) -> list[Pending]:
@@ -255,9 +258,10 @@ class InFlight:
         if not of_endpoint:
             del self._by_endpoint[endpoint]
         self._by_transport[endpoint.transport] -= 1
-        key = endpoint, pending.onward, pending.header.invoke_id
-        if self._asked.get(key) == pending.invoke_id:
-            del self._asked[key]
+        if pending.may_repeat:
+            key = endpoint, pending.onward, pending.header.invoke_id
+            if self._asked.get(key) == pending.invoke_id:
+                del self._asked[key]
 
 
 class RouterLimits(NamedTuple):
@@ -369,10 +373,14 @@ class Admission:
             return RoutingError(AdsError.TARGET_MACHINE, text)
         return self._find_obstacle(header, endpoint, route) or route
 
+    def may_repeat(self, endpoint: Endpoint) -> bool:
+        """Return whether a request of *endpoint* may come twice."""
+        # On TCP nothing arrives twice; two equal requests there are two requests.
+        return not self._transports[endpoint.transport].is_stream
+
     def is_duplicate(self, header: AmsHeader, onward: bytes, endpoint: Endpoint) -> bool:
         """Return whether the same request, repeated or doubled, waits already."""
-        # On TCP nothing arrives twice; two equal requests there are two requests.
-        if self._transports[endpoint.transport].is_stream:
+        if not self.may_repeat(endpoint):
             return False
         return self._in_flight.has_request(endpoint, onward, header.invoke_id)
 

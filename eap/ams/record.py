@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict, deque
 from collections.abc import Hashable
 from enum import StrEnum
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
 import msgspec
 
@@ -34,20 +34,29 @@ class Outcome(StrEnum):
     RESTORED = "restored"
     """Subscriptions that were interrupted are established again."""
 
+    __hash__ = str.__hash__  # that of enums is slow
 
-class Trace(NamedTuple):
-    """Outcome of one packet; *text* is for operators and names the hop where there is one."""
+
+class Trace(msgspec.Struct, frozen=True, gc=False):
+    """Outcome of one packet.
+
+    Attributes:
+        at_ns: Time of the outcome.
+        outcome: As named.
+        endpoint: Of its client; None if its connection is gone.
+        hop: None if it went no further.
+        header: Of the request, as it came; None if it could not be read.
+        error_code: Of the AMS header of the answer.
+        took_ns: From the request to the answer.
+        text: For operators; it names the hop where there is one.
+    """
 
     at_ns: int
     outcome: Outcome
     endpoint: Endpoint | None
-    """None if its connection is gone."""
     hop: Endpoint | None
-    """None if it went no further."""
     header: AmsHeader | None
-    """Of the request, as it came; None if it could not be read."""
     error_code: int
-    """Of the AMS header of the answer."""
     took_ns: int
     text: str
 
@@ -151,19 +160,68 @@ MAX_LATEST = 256
 class Record:
     """Traces, counters and traffic of a router.
 
-    Attributes:
-        latest: The latest traces, the oldest first; without answers to probes.
-        counts: Packets by outcome.
-        connections: Requests from each open connection.
-        routes: Traffic by each route.
+    A request that was simply answered is counted after its answer was sent, by :meth:`settle`; all
+    that is read here has it.
     """
 
     def __init__(self) -> None:
-        self.latest: deque[Trace] = deque(maxlen=MAX_LATEST)
-        self.counts = dict.fromkeys(Outcome, 0)
-        self.connections: TrafficTable[Endpoint] = TrafficTable()
-        self.routes: TrafficTable[RouteKey] = TrafficTable()
+        self._latest: deque[Trace] = deque(maxlen=MAX_LATEST)
+        self._counts = dict.fromkeys(Outcome, 0)
+        self._connections: TrafficTable[Endpoint] = TrafficTable()
+        self._routes: TrafficTable[RouteKey] = TrafficTable()
         self._events: deque[Trace] = deque(maxlen=MAX_EVENTS)
+        self._answered: tuple[Trace, Endpoint, RouteKey | None, int] | None = None
+
+    @property
+    def latest(self) -> deque[Trace]:
+        """The latest traces, the oldest first; without answers to probes."""
+        self.settle()
+        return self._latest
+
+    @property
+    def counts(self) -> dict[Outcome, int]:
+        """Packets by outcome."""
+        self.settle()
+        return self._counts
+
+    @property
+    def connections(self) -> TrafficTable[Endpoint]:
+        """Requests from each open connection."""
+        self.settle()
+        return self._connections
+
+    @property
+    def routes(self) -> TrafficTable[RouteKey]:
+        """Traffic by each route."""
+        self.settle()
+        return self._routes
+
+    def add_answered(
+        self, trace: Trace, endpoint: Endpoint, route: RouteKey | None, octets: int
+    ) -> None:
+        """Add the trace of a request that was simply answered.
+
+        Args:
+            trace: Without error and text.
+            endpoint: Of the client.
+            route: That the request was forwarded by.
+            octets: Size of the answer.
+        """
+        self.settle()
+        self._answered = trace, endpoint, route, octets
+
+    def settle(self) -> None:
+        """Count the request that was answered last."""
+        if self._answered is None:
+            return
+        trace, endpoint, route, octets = self._answered
+        self._answered = None
+        self._connections.of(endpoint, trace.at_ns).add_answer(octets, trace.took_ns)
+        if route is not None:
+            self._routes.of(route, trace.at_ns).add_answer(octets, trace.took_ns)
+        self._counts[_ANSWERED] += 1
+        if not _is_probe(trace):
+            self._latest.append(trace)
 
     @property
     def has_events(self) -> bool:
@@ -176,10 +234,11 @@ class Record:
 
     def add(self, trace: Trace) -> None:
         """Add the trace of a packet."""
-        self.counts[trace.outcome] += 1
+        self.settle()
+        self._counts[trace.outcome] += 1
         if _is_probe(trace):
             return
-        self.latest.append(trace)
+        self._latest.append(trace)
         if trace.outcome is _ANSWERED and not trace.error_code and not trace.text:
             return
         self._events.append(trace)

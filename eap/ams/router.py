@@ -259,6 +259,10 @@ class Router:
         """True if there are traces or audit entries to be read."""
         return self.record.has_events or self.access_filter.has_entries
 
+    def settle(self) -> None:
+        """Count what was answered, when the answers have been sent."""
+        self.record.settle()
+
     def next_event(self) -> Trace | None:
         """Take the oldest trace of what was not simply answered."""
         return self.record.next_event()

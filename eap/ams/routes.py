@@ -19,6 +19,8 @@ from eap.ids import Endpoint, NetId, prefix_text
 
 MAX_LEARNED = 10_000
 """Limit of learned routes; further ones are ignored."""
+MAX_FOUND = 1024
+"""Limit of the targets whose routes are kept until the next change of the table."""
 _LEVELS = (6, 5, 4, 0)
 _Key = TypeVar("_Key")
 _Item = TypeVar("_Item")
@@ -143,6 +145,7 @@ class RouteTable:
         self._learned = 0
         self._number = 0
         self._next_expiry: int | None = None
+        self._found: dict[NetId, tuple[Route, int] | None] = {}
         for route in routes:
             self.add(route)
 
@@ -170,6 +173,7 @@ class RouteTable:
             return False
         self._number += 1
         self.version += 1
+        self._found.clear()
         ranked = _Ranked(rank, route)
         self._routes[key] = ranked
         for prefix in _prefixes(route):
@@ -189,6 +193,7 @@ class RouteTable:
             return False
         route = ranked.route
         self.version += 1
+        self._found.clear()
         for prefix in _prefixes(route):
             _discard(self._by_prefix, prefix, ranked)
         if route.real is not None:
@@ -198,6 +203,17 @@ class RouteTable:
 
     def find(self, target: NetId) -> tuple[Route, int] | None:
         """Return the route to *target*, and how many bytes of its NetID match."""
+        try:
+            return self._found[target]
+        except KeyError:
+            pass
+        # NetIDs can be invented: what is kept must not grow with them.
+        if len(self._found) >= MAX_FOUND:
+            self._found.clear()
+        found = self._found[target] = self._look_up(target)
+        return found
+
+    def _look_up(self, target: NetId) -> tuple[Route, int] | None:
         by_prefix = self._by_prefix
         learned = None
         for level in _LEVELS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import msgspec
 
@@ -12,33 +12,46 @@ from eap.codec.ams import AmsHeader
 from eap.ids import Endpoint
 
 
-class Forward(NamedTuple):
-    """A request for the next hop."""
+class Forward(msgspec.Struct, frozen=True, gc=False):
+    """A request for the next hop.
+
+    Attributes:
+        hop: Where it goes.
+        packets: One, or its fragments in their order.
+        ticket: Names the request, for a transport that cannot send it.
+    """
 
     hop: Endpoint
     packets: tuple[bytes, ...]
-    """One, or its fragments in their order."""
     ticket: int
-    """Names the request, for a transport that cannot send it."""
 
 
-class Reply(NamedTuple):
-    """An answer or a notification, for the connection that it belongs to."""
+class Reply(msgspec.Struct, frozen=True, gc=False):
+    """An answer or a notification, for the connection that it belongs to.
+
+    Attributes:
+        endpoint: The connection.
+        packets: One, or its fragments in their order.
+    """
 
     endpoint: Endpoint
     packets: tuple[bytes, ...]
-    """One, or its fragments in their order."""
 
 
-class Deliver(NamedTuple):
-    """A request for a service of this station."""
+class Deliver(msgspec.Struct, frozen=True, gc=False):
+    """A request for a service of this station.
+
+    Attributes:
+        ticket: Names the request, for its answer.
+        header: As it came.
+        body: What follows the header.
+        endpoint: Endpoint of the client; its notifications go there too.
+    """
 
     ticket: int
-    """Names the request, for its answer."""
     header: AmsHeader
     body: bytes
     endpoint: Endpoint
-    """Endpoint of the client; its notifications go there too."""
 
 
 Action: TypeAlias = Forward | Reply | Deliver
@@ -115,15 +128,16 @@ class TransportTable:
 
     def reply(self, endpoint: Endpoint, packet: bytes) -> Reply:
         """Return the action that sends *packet* back to *endpoint*."""
-        return Reply(endpoint, self._split(endpoint.transport, packet))
+        max_size = self._transports[endpoint.transport].max_size
+        is_whole = not max_size or len(packet) <= max_size
+        return Reply(endpoint, (packet,) if is_whole else self._split(packet, max_size))
 
     def forward(self, hop: Endpoint, packet: bytes, ticket: int) -> Forward:
         """Return the action that sends *packet* to *hop*."""
-        return Forward(hop, self._split(hop.transport, packet), ticket)
+        max_size = self._transports[hop.transport].max_size
+        is_whole = not max_size or len(packet) <= max_size
+        return Forward(hop, (packet,) if is_whole else self._split(packet, max_size), ticket)
 
-    def _split(self, transport: str, packet: bytes) -> tuple[bytes, ...]:
-        max_size = self._transports[transport].max_size
-        if not max_size or len(packet) <= max_size:
-            return (packet,)
+    def _split(self, packet: bytes, max_size: int) -> tuple[bytes, ...]:
         self._number += 1
         return tuple(iter_fragments(packet, self._number, max_size - AmsHeader.SIZE))

@@ -91,6 +91,9 @@ class AmsHeader(WireStruct, frozen=True):
         return not (self.state_flags & _NO_RETURN or self.command == _NOTIFICATION)
 
 
+_HEADER = AmsHeader.LAYOUT
+
+
 def decode_packet(data: Buffer, offset: int = 0) -> tuple[AmsHeader, memoryview]:
     """Return header and data of the packet at *offset*; surplus bytes behind it are ignored.
 
@@ -136,7 +139,8 @@ class AmsAnswer(NamedTuple):
 def response_to(header: AmsHeader, answer: AmsAnswer) -> bytes:
     """Return the packet with *answer* to the request with *header*."""
     data = answer.data
-    back = AmsHeader(
+    # Packed at once: a station does this for each request.
+    head = _HEADER.pack(
         header.source,
         header.source_port,
         header.target,
@@ -147,7 +151,7 @@ def response_to(header: AmsHeader, answer: AmsAnswer) -> bytes:
         answer.error_code,
         header.invoke_id,
     )
-    return back.encode() + data
+    return head + data
 
 
 AMS_TCP_PORT = 48898

@@ -30,7 +30,7 @@ from eap.ams.report import ConnectionReport, Location, Obstacle, RouteReport
 from eap.ams.router import Router
 from eap.ams.routes import Route, RouteTable
 from eap.ams.subscription_restorer import Interruption
-from eap.ams.transport_table import Action, Forward, Reply, Transport
+from eap.ams.transport_table import Action, Deliver, Forward, Reply, Transport
 from eap.codec.ams import AmsAnswer, AmsHeader, encode_packet
 from eap.ids import Endpoint, NetId
 from eap.services.limited_log import caused_by
@@ -450,14 +450,15 @@ class StationRouter:
     def _act(self, actions: list[Action]) -> None:
         if self._router.has_events:
             self._publish_events()  # first: the audit is written before the answer is sent
-        for action in actions:  # comparing classes is faster than match
-            kind = type(action)
-            if kind is Reply:
-                self._reply(*action)
-            elif kind is Forward:
-                self._forward(*action)
+        for action in actions:  # isinstance() is faster than match
+            if isinstance(action, Reply):
+                endpoint = action.endpoint
+                self._senders[endpoint.transport].send(endpoint.connection, action.packets)
+            elif isinstance(action, Forward):
+                self._forward(action)
             else:
-                self._deliver(*action)
+                self._deliver(action)
+        self._router.settle()
         for endpoint, (count, event) in self._below_waiters.items():
             if self._router.waiting(endpoint) < count:
                 event.set()
@@ -471,13 +472,11 @@ class StationRouter:
             for write in self.on_audit:
                 write(entry)
 
-    def _reply(self, endpoint: Endpoint, packets: tuple[bytes, ...]) -> None:
-        self._senders[endpoint.transport].send(endpoint.connection, packets)
-
-    def _forward(self, hop: Endpoint, packets: tuple[bytes, ...], ticket: int) -> None:
-        text = self._senders[hop.transport].send(hop.connection, packets)
+    def _forward(self, action: Forward) -> None:
+        hop = action.hop
+        text = self._senders[hop.transport].send(hop.connection, action.packets)
         if text is not None:
-            self._act(self._router.send_failed(ticket, text, monotonic_ns()))
+            self._act(self._router.send_failed(action.ticket, text, monotonic_ns()))
 
     def _answer_now(
         self, header: AmsHeader, body: bytes, endpoint: Endpoint
@@ -488,10 +487,11 @@ class StationRouter:
             return None
         return self._services.answer_now(header, body)
 
-    def _deliver(self, ticket: int, header: AmsHeader, body: bytes, endpoint: Endpoint) -> None:
-        service = self._services.find(header)
+    def _deliver(self, action: Deliver) -> None:
+        service = self._services.find(action.header)
         if service is not None:
-            self._queues.put(ticket, service, LocalRequest(header, body, endpoint))
+            request = LocalRequest(action.header, action.body, action.endpoint)
+            self._queues.put(action.ticket, service, request)
 
     def _finish(self, ticket: int, answer: AmsAnswer) -> None:
         self._act(self._router.receive_answer(ticket, answer, monotonic_ns()))

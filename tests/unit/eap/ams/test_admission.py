@@ -82,7 +82,7 @@ def test_admission_finds_loop_by_addresses_and_command() -> None:
 def test_admission_checks_duplicates_on_datagram_transports_only() -> None:
     admission, waiting, route = make()
     for number, endpoint in enumerate((TCP, SEGMENT)):
-        waiting.add(Pending(number, ASKED, endpoint, route, b"addresses", 0, 1))
+        waiting.add(Pending(number, ASKED, endpoint, route, b"addresses", 0, 1, may_repeat=True))
     assert admission.is_duplicate(ASKED, b"addresses", SEGMENT)
     assert not admission.is_duplicate(ASKED, b"addresses", TCP)
 

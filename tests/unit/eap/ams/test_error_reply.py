@@ -26,7 +26,8 @@ def test_refusal_is_answered_counted_and_traced() -> None:
     )
     trace = record.next_event()
     assert trace is not None
-    assert trace[:4] == (9, Outcome.FAILED, WAY, HOP)
+    assert (trace.at_ns, trace.outcome) == (9, Outcome.FAILED)
+    assert (trace.endpoint, trace.hop) == (WAY, HOP)
     assert (trace.error_code, trace.took_ns) == (0x1B, 4)
     assert trace.text == f"READ of {ASKED.target} for {ASKED.source} ({WAY}): the cable is cut"
     assert record.connections.of(WAY, 9).last_error == "the cable is cut"

@@ -49,7 +49,9 @@ def pending(
     route: Route | None = ROUTE,
 ) -> Pending:  # fmt: skip
     header = AmsHeader(NetId(b"target"), 1, NetId(b"source"), 2, 2, invoke_id=7)
-    return Pending(invoke_id, header, endpoint, route, b"addresses", at_ns, at_ns + allowed_ns)
+    return Pending(
+        invoke_id, header, endpoint, route, b"addresses", at_ns, at_ns + allowed_ns, may_repeat=True
+    )
 
 
 def filled(*items: Pending) -> InFlight:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from eap.ams.record import (
     MAX_ENDPOINTS,
     MAX_EVENTS,
@@ -90,11 +92,50 @@ def test_record_answered_request_is_no_event() -> None:
 def test_answers_to_probes_are_counted_only() -> None:
     record = Record()
     probe = AmsHeader(NetId.parse("5.1.1.1.1.1"), 10000, NetId.parse("6.1.1.1.1.1"), 1, 4)
-    alive = trace(1, Outcome.ANSWERED, 0)._replace(header=probe)
+    alive = replace(trace(1, Outcome.ANSWERED, 0), header=probe)
     record.add(alive)
-    record.add(alive._replace(error_code=6))
+    record.add(replace(alive, error_code=6))
     assert [each.error_code for each in record.latest] == [6]
     assert record.counts[Outcome.ANSWERED] == 2
+
+
+def test_record_counts_an_answered_request_before_anything_is_read() -> None:
+    endpoint, hop = Endpoint("tcp", "1"), Endpoint("link", "2")
+    key = NetId.parse("5.1.1.1.1.1"), hop
+    for read in (
+        lambda record: record.connections.snapshot()[endpoint].answers,
+        lambda record: record.routes.snapshot()[key].answers,
+        lambda record: record.counts[Outcome.ANSWERED],
+        lambda record: len(record.latest),
+    ):
+        record = Record()
+        for number in (1, 2):
+            answered = Trace(number, Outcome.ANSWERED, endpoint, hop, None, 0, 5, "")
+            record.add_answered(answered, endpoint, key, 40)
+        assert read(record) == 2
+        record.settle()
+        assert read(record) == 2, "counted once"
+        assert not record.has_events
+
+
+def test_record_keeps_the_order_of_traces() -> None:
+    record = Record()
+    endpoint = Endpoint("tcp", "1")
+    record.add_answered(
+        Trace(1, Outcome.ANSWERED, endpoint, None, None, 0, 5, ""), endpoint, None, 40
+    )
+    record.add(trace(2))
+    assert [each.at_ns for each in record.latest] == [1, 2]
+
+
+def test_record_of_a_forgotten_connection_stays_forgotten() -> None:
+    record = Record()
+    endpoint = Endpoint("tcp", "1")
+    record.add_answered(
+        Trace(1, Outcome.ANSWERED, endpoint, None, None, 0, 5, ""), endpoint, None, 40
+    )
+    record.connections.forget(endpoint)
+    assert record.connections.snapshot() == {}
 
 
 def test_traces_are_limited() -> None:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eap.ams.routes import MAX_LEARNED, Origin, Route, RouteTable
+from eap.ams.routes import MAX_FOUND, MAX_LEARNED, Origin, Route, RouteTable
 from eap.ids import Endpoint, NetId
 
 A, B, C = (Endpoint("tcp", name) for name in "abc")
@@ -32,6 +32,25 @@ def test_longest_match_is_taken() -> None:
     assert hop_of(table, "5.1.1.2.3.2") == Endpoint("mqtt", "rest")
     assert [table.find(NetId.parse(each))[1] for each in ("5.1.1.1.3.2", "5.1.1.1.3.9")] == [6, 5]
     assert hop_of(RouteTable([route("5.1.1.1.3.2", octets=6)]), "5.1.1.1.3.1") is None
+
+
+def test_find_follows_changes_of_the_table() -> None:
+    table = RouteTable([route("5.1.1.1.1.1", A)])
+    assert hop_of(table, "5.1.1.1.2.1") == A
+    assert hop_of(table, "6.1.1.1.1.1") is None
+    table.add(route("5.1.1.1.2.1", B, octets=6))
+    table.add(route("6.1.1.1.1.1", C))
+    assert (hop_of(table, "5.1.1.1.2.1"), hop_of(table, "6.1.1.1.1.1")) == (B, C)
+    table.remove(NetId.parse("5.1.1.1.2.1"), B)
+    assert hop_of(table, "5.1.1.1.2.1") == A
+
+
+def test_table_keeps_a_limited_number_of_found_routes() -> None:
+    table = RouteTable([route("5.1.1.1.1.1", A)])
+    for number in range(3 * MAX_FOUND):
+        assert table.find(NetId((6, 0, 0, 0, number >> 8, number & 0xFF))) is None
+        assert len(table._found) <= MAX_FOUND
+    assert hop_of(table, "5.1.1.1.1.1") == A
 
 
 def test_configured_routes_go_before_learned_ones() -> None:

@@ -151,6 +151,6 @@ def test_request_row_has_all_fields() -> None:
     assert (found.source, found.came_by) == ("5.1.1.1.1.1:30000", "127.0.0.1:1 by ams-tcp")
     assert (found.transport, found.address, found.error, found.took_us) == (*HOP, 6, 2000)
     said = "READ of 127.0.9.2.1.1:851 for 5.1.1.1.1.1:30000 (127.0.0.1:1 by ams-tcp): cut"
-    assert request_row(trace._replace(text=said), 4 * 10**9).text == "cut"
-    bare = request_row(trace._replace(endpoint=None, hop=None, header=None), 4 * 10**9)
+    assert request_row(replace(trace, text=said), 4 * 10**9).text == "cut"
+    bare = request_row(replace(trace, endpoint=None, hop=None, header=None), 4 * 10**9)
     assert (bare.service, bare.came_by, bare.transport, bare.text) == ("", "", "", "no such port")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 
+from msgspec.structs import replace
+
 from eap.ams.record import Outcome, Trace, describe
 from eap.codec.ams import AmsHeader
 from eap.ids import Endpoint, NetId
@@ -90,5 +92,5 @@ def test_trace_log_packet_without_a_request_is_logged(caplog):
 
 def test_trace_log_answer_without_header_error_has_no_code(caplog):
     caplog.set_level(logging.INFO)
-    TraceLog("island").write(trace(Outcome.ANSWERED)._replace(error_code=0, text="no way"))
+    TraceLog("island").write(replace(trace(Outcome.ANSWERED), error_code=0, text="no way"))
     assert caplog.messages == ["island: no way"]
