@@ -491,6 +491,8 @@ class Plant(msgspec.Struct, frozen=True):
     """Patterns of the variables that operators set by the control socket."""
     hosts: tuple[HostSection, ...] = ()
     """Computers that run the stations; empty for a plant of one."""
+    spins: bool = False
+    """True if the engine polls instead of sleeping between two cycles."""
     web: WebSection | None = None
     """Page for browsers, with resolved paths; None without one."""
     metrics: MetricsSection | None = None
@@ -608,6 +610,7 @@ def load(path: Path, describe_bus: DescribeBus, folder: Path | None = None) -> P
         users=plant_file.users,
         operators=plant_file.access.operators,
         hosts=plant_file.hosts,
+        spins=plant_file.realtime.spin,
         web=plant_file.web and resolved(plant_file.web, path.parent),
         metrics=plant_file.metrics and resolved_tls(plant_file.metrics, path.parent),
         record=resolved_recordings(plant_file.record, path.parent),

@@ -528,6 +528,7 @@ class RealtimeSection(Section, frozen=True):
     """Pace of the engine."""
 
     groups: Annotated[int, Meta(ge=1, le=64)] | None = None
+    spin: bool = False
 
 
 class AuditMode(StrEnum):

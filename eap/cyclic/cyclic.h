@@ -4,8 +4,9 @@
    Python, so each of them is handled by one of the two alone.  Nothing here keeps state of its own
    but the offset of two clocks: plans, trackers and counters are those of Python.
 
-   Limited API of CPython 3.11.  The GIL is held throughout: no call blocks, and a cycle that gave it
-   up would have to wait for the thread that prepares a change.  */
+   Limited API of CPython 3.11.  The GIL is held throughout but for the wait between two cycles: no
+   other call blocks, and a cycle that gave it up would have to wait for the thread that prepares a
+   change.  */
 
 #ifndef EAP_CYCLIC_H
 #define EAP_CYCLIC_H
@@ -106,7 +107,7 @@ int send_due(PyObject *plan, PyObject *publisher, PyObject *channel, PyObject *n
 extern PyTypeObject *plan_type, *handler_type, *receiver_type, *drain_type, *patch_type,
     *send_plan_type;
 extern PyType_Spec plan_spec, handler_spec, receiver_spec, drain_spec, patch_spec, send_plan_spec,
-    cycle_spec;
+    cycle_spec, waiter_spec;
 extern PyObject *text_fast, *text_source, *text_source_of, *text_wanted, *text_direct, *text_send,
     *text_address_of, *text_plan;
 

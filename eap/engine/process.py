@@ -46,20 +46,19 @@ class CycleWaiter:
         self._is_open = False
         self._open()
 
-    def wait(self, deadline_ns: int) -> bool:
-        """Return True once *deadline_ns* has passed, False if descriptors were served first."""
+    def wait(self, deadline_ns: int) -> int:
+        """Return the time once *deadline_ns* has passed, 0 if descriptors were served first."""
         if self._is_open:
-            if self._ticker.wait(deadline_ns):
-                return True
-            self._serve()
-            return False
+            now_ns = self._ticker.wait(deadline_ns)
+            if not now_ns:
+                self._serve()
+            return now_ns
         # The descriptors are unregistered, not ignored: a readable one would end every wait at
         # once.
-        is_due = self._ticker.wait(min(deadline_ns, self._window_end_ns))
-        now_ns = monotonic_ns()
-        if now_ns >= self._window_end_ns:
+        now_ns = self._ticker.wait(min(deadline_ns, self._window_end_ns))
+        if monotonic_ns() >= self._window_end_ns:
             self._open()
-        return is_due and now_ns >= deadline_ns
+        return now_ns if now_ns >= deadline_ns else 0
 
     def _serve(self) -> None:
         begun_ns = monotonic_ns()
@@ -123,13 +122,18 @@ class StopFlag:
 
 
 def run_cycles(
-    plant: EnginePlant, link: socket.socket, stop: StopFlag, notify: Callable[[], None]
+    plant: EnginePlant,
+    link: socket.socket,
+    stop: StopFlag,
+    notify: Callable[[], None],
+    *,
+    spins: bool = False,
 ) -> None:
     """Run every cycle when it is due, until *stop* is set; *notify* once the stations run."""
     engine, rebuilder = plant.engine, plant.rebuilder
     look_ns = 0
     is_notified = False
-    ticker = Ticker()
+    ticker = Ticker(spins=spins)
     try:
         arrivals = CycleWaiter(ticker, plant.arrivals)
         rebuilder.on_swap.append(arrivals.update)
@@ -139,9 +143,9 @@ def run_cycles(
             if not is_notified and engine.is_under_way:
                 is_notified = True
                 notify()
-            if not arrivals.wait(engine.next_timeout()):
+            now_ns = arrivals.wait(engine.next_timeout())
+            if not now_ns:
                 continue
-            now_ns = monotonic_ns()
             engine.handle_timeout(now_ns)
             if rebuilder.is_ready:
                 rebuilder.swap(now_ns)
@@ -174,12 +178,15 @@ def run_engine(handover: Handover, startup: Startup) -> None:
     try:
         startup.step("locking memory, setting the scheduler")
         report = _prepare(handover.options)
+        if handover.options.spins:
+            report["spins"] = True
         startup.step("starting the stations")
         plant.start(monotonic_ns())
         startup.step("running the first cycle")
         started = {"realtime": report, "compiled": cyclic is not None}
         # A program that attaches behind the ready line finds values of a cycle, not an empty image.
-        run_cycles(plant, link, stop, partial(startup.finish, started))
+        notify = partial(startup.finish, started)
+        run_cycles(plant, link, stop, notify, spins=handover.options.spins)
         plant.stop()
     finally:
         plant.close()

@@ -16,6 +16,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeAlias
 
+from eap.errors import EnvironmentalError
+
 Report: TypeAlias = dict[str, str | bool | int | list[int]]
 
 _PR_SET_PDEATHSIG = 1
@@ -50,6 +52,15 @@ def prepare(priority: int, cpus: Iterable[int] = ()) -> Report:
     gc.freeze()
     gc.disable()
     return report
+
+
+def require_cores() -> None:
+    """Raise EnvironmentalError unless one process may take a processor for itself."""
+    if len(os.sched_getaffinity(0)) < 2:
+        raise EnvironmentalError(
+            "realtime.spin cannot be used: the engine would take the only processor that this"
+            " appliance has; remove the key, or allow it a second one"
+        )
 
 
 def raise_process_priority(nice: int = -10) -> None:

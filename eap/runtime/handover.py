@@ -211,6 +211,8 @@ class EngineOptions(SpecRecord, frozen=True):
     """Run on this processor only; -1 on any."""
     priority: int = 50
     """Of SCHED_FIFO, 1 to 99."""
+    spins: bool = False
+    """Poll instead of sleeping between two cycles; the plant file has it."""
 
 
 class Handover(InheritedRecord, frozen=True):

@@ -22,7 +22,7 @@ from eap.ams.spec import RoutingSpec
 from eap.config.load import Plant
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri
-from eap.net.realtime import raise_descriptor_limit
+from eap.net.realtime import raise_descriptor_limit, require_cores
 from eap.pd.device import DeviceState
 from eap.pd.spec import StationSpec
 from eap.runtime.folder import ApplianceFolder, ApplianceInfo, ProcessInfo, folder_name
@@ -125,6 +125,9 @@ def _run(
     first_state: DeviceState = DeviceState.OP,
 ) -> int:
     stations = plant.stations
+    if plant.spins:
+        require_cores()
+        options = replace(options, spins=True)
     adopt_plant_file(info.plant, stations, first_state)
     if info.plant_file:
         _log_stored_differences(info.plant, stations)

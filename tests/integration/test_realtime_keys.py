@@ -76,3 +76,28 @@ def test_groups_stay_as_they_are_over_a_restart_of_the_engine(appliance: Applian
     appliance.wait_for_another("engine", pid)
     wait_until(lambda: all(each["restarts"] for each in appliance.status()["stations"]))
     assert groups(appliance) == before
+
+
+SPINNING = PLANT.replace("{groups: 2}", "{spin: true}").replace("127.9.61.", "127.9.62.")
+
+
+def test_engine_of_a_spinning_plant_takes_most_of_a_processor(farm: Plants) -> None:
+    appliance = farm.run(farm.write(SPINNING))
+
+    def engine() -> dict[str, Any]:
+        return appliance.status()["processes"]["engine"]
+
+    assert engine()["realtime"]["spins"] is True
+    # It shares the processor with other tests; one that sleeps takes some percent.
+    wait_until(lambda: engine()["cpu"] > 25)
+
+
+def test_spinning_plant_is_refused_on_a_single_processor(farm: Plants) -> None:
+    only = str(min(os.sched_getaffinity(0)))
+    refused = farm.start(farm.write(SPINNING), prefix=("taskset", "-c", only))
+    code, out, err = refused.finish()
+    assert (code, out) == (2, "")
+    assert err.endswith(
+        "realtime.spin cannot be used: the engine would take the only processor that this"
+        " appliance has; remove the key, or allow it a second one\n"
+    )

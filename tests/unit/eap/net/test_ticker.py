@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import signal
 import time
+from contextlib import closing
 
 import pytest
 
+from eap.compiled import cyclic
 from eap.net.ticker import Ticker
 
 pytestmark = [pytest.mark.net, pytest.mark.quiet]
@@ -15,9 +17,18 @@ pytestmark = [pytest.mark.net, pytest.mark.quiet]
 LATER_NS = 10_000_000_000
 
 
-@pytest.fixture
-def ticker():
-    made = Ticker()
+@pytest.fixture(params=[None, cyclic], ids=["python", "compiled"])
+def path(request, monkeypatch):
+    """Wait by Python, or by the compiled part."""
+    if request.param is None:
+        monkeypatch.setattr("eap.net.ticker.cyclic", None)
+    elif cyclic is None:
+        pytest.skip("without compiled part")
+
+
+@pytest.fixture(params=[False, True], ids=["sleeps", "spins"])
+def ticker(path, request):
+    made = Ticker(spins=request.param)
     yield made
     made.close()
 
@@ -85,6 +96,32 @@ def test_signal_ends_the_wait_and_its_handler_has_run(ticker, pipe, with_descrip
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
+
+
+def test_spinning_ticker_takes_the_processor_and_another_one_does_not(path, pipe):
+    shares = []
+    for spins in (False, True):
+        with closing(Ticker(spins=spins)) as ticker:
+            ticker.register(pipe[0])
+            before_ns, end_ns = time.thread_time_ns(), time.monotonic_ns() + 100_000_000
+            while not ticker.wait(end_ns):
+                pass
+            shares.append(time.thread_time_ns() - before_ns)
+    assert shares[1] > 5 * shares[0]
+
+
+def test_compiled_waiter_refuses_what_it_could_not_use():
+    waiter = pytest.importorskip("eap._cyclic").Waiter
+    with pytest.raises(ValueError, match="memory for an event"):
+        waiter(0, 0, bytearray(4), 2, 1)
+    with pytest.raises(ValueError, match="shorter than itself"):
+        waiter(0, 0, bytearray(64), 1, 2)
+    with pytest.raises(BufferError):
+        waiter(0, 0, bytes(64), 2, 1)
+    made = waiter(-1, -1, bytearray(64), 2, 1)  # of closed descriptors: a wait ends at once
+    assert made.wait(time.monotonic_ns() + LATER_NS) == 0
+    with pytest.raises(ValueError, match="too late"):
+        made.wait(1 << 62)
 
 
 def test_closing_twice_is_harmless(pipe):
