@@ -95,6 +95,7 @@ def decode_discovery(data: Buffer) -> Discovery:
     for _ in range(header.count):  # each takes bytes, so there are never more than those allow
         tag = TagHeader.decode(data, at)
         at += TagHeader.SIZE
+        # A tag that is cut off would be read as a shorter password or name.
         if len(data) - at < tag.length:
             raise TruncatedError(
                 f"length {tag.length}, but {len(data) - at} bytes follow",

@@ -367,6 +367,7 @@ def _dt_bytes(ns: int) -> bytes:
 def _dt_ns(data: bytes) -> int:
     year, month, day, hour, minute, second, centi = (_from_bcd(each) for each in data[:7])
     ms = 10 * centi + (data[7] >> 4)
+    # The two digits of a year are those of 1990 to 2089.
     year += 1900 if year >= 90 else 2000
     return _ns_of(year, month, day, hour, minute, second) + ms * _MS
 
@@ -380,6 +381,7 @@ def _ns_of(year: int, month: int, day: int, hour: int, minute: int, second: int)
 
 def _s5_bytes(ns: int) -> bytes:
     ms = ns // _MS
+    # The finest base that holds the time loses least of it.
     for number, base in enumerate(_S5_BASES_MS):
         if ms // base <= 999:
             count = ms // base
@@ -468,6 +470,7 @@ _S7_FAMILIES: tuple[tuple[type[DataType], Callable[[Any], FieldType]], ...] = (
 
 
 def _s7_named(kind: DataType, text: str) -> FieldType:
+    # STRING[20] is the form of S7, STRING(20) that of plant files.
     upper = text.strip().upper().replace("(", "[").replace(")", "]")
     name, _, length = upper.partition("[")
     name = _S7_ALIASES.get(name.strip(), name.strip())
@@ -662,6 +665,7 @@ def _array(kind: Array, element: FieldType, stride: int, text: str) -> FieldArra
 
 def _struct(kind: Structure, convert: Callable[[DataType], FieldType]) -> FieldStruct:
     starts = [each.bit_offset for each in kind.members]
+    # Which of the members the other side means is not in the bytes.
     if len(starts) > 1 and not any(starts):
         raise ValueError(f"{kind.name} is a union: expected a struct, or one of its members")
     members, end = [], 0

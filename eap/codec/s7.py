@@ -209,6 +209,7 @@ def packet_length(buffer: Buffer) -> int | None:
     """
     if len(buffer) < TPKT_SIZE:
         return None
+    # RFC 1006: version 3, a reserved byte, the length with this header.
     version, _, length = struct.unpack_from(">BBH", buffer)
     if version != 3 or not TPKT_SIZE < length <= MAX_TPKT:
         raise MalformedError(f"version {version}, {length} bytes", layout="TPKT")
@@ -263,6 +264,7 @@ def decode_cotp(packet: bytes) -> CotpConnect | S7Pdu:
         raise TruncatedError(f"{len(payload)} bytes", layout="COTP")
     kind = payload[1] & 0xF0
     if kind == CotpKind.DATA:
+        # The last bit of the number: S7 puts each PDU into one TPDU.
         if not payload[2] & 0x80:
             raise MalformedError("a PDU in several packets", layout="COTP")
         return S7Pdu.decode(payload[payload[0] + 1 :])
@@ -355,6 +357,7 @@ def decode_item_data(data: bytes, count: int) -> list[ItemData]:
         code, kind, length = struct.unpack_from(">BBH", data, at)
         size = -(-length // 8) if kind in _IN_BITS and kind != _DATA_BIT else length
         at += 4
+        # An item with an error has no data, whatever its length says.
         if kind and at + size > len(data):
             raise TruncatedError(f"item {number + 1} of {count} is cut off", layout="S7 data")
         if not kind:

@@ -135,6 +135,7 @@ def length_of(data: Buffer) -> int | None:
     if len(data) < 2:
         return None
     length = int.from_bytes(data[:2], "little")
+    # Found before the bytes are waited for: a peer could have kept them away until the time-out.
     if not TlsConnectInfo.SIZE <= length <= LONGEST:
         raise MalformedError(
             f"length {length}, expected {TlsConnectInfo.SIZE} to {LONGEST}", layout="TlsConnectInfo"

@@ -45,6 +45,7 @@ class XmlLimits(NamedTuple):
 
 
 DEFAULT_LIMITS = XmlLimits()
+# ESI files write hexadecimal numbers with #x.
 _INTEGER = re.compile(r"([-+]?)(?:(#x|0x)([0-9a-f]{1,16})|([0-9]{1,20}))", re.ASCII | re.IGNORECASE)
 _TRUE, _FALSE = frozenset(("1", "true")), frozenset(("0", "false", ""))
 
@@ -269,6 +270,7 @@ class _TreeBuilder:
 
     def start(self, tag: str, attrib: dict[str, str]) -> None:
         self._depth += 1
+        # Checked in what is skipped, too: the parser keeps each open element.
         if self._depth > self._limits.depth:
             self._refuse("elements are nested too deeply", f"at most {self._limits.depth} levels")
         if self._skipped:
@@ -278,6 +280,7 @@ class _TreeBuilder:
         if name in self._ignored:
             self._skipped = 1
             return
+        # Without their namespaces, which vendors declare or leave out.
         attributes = {key.rpartition("}")[2]: value for key, value in attrib.items()}
         element = XmlElement(name, attributes, self._line())
         if not self._open:

@@ -145,6 +145,7 @@ def findings(status: MergedStatus, now_s: float) -> list[StatusFinding]:
         found += [replace(each, plant=plant) for each in _of_engine(label, stations, now_s)]
         for station in stations:
             found += [replace(each, plant=plant) for each in _of_station(station)]
+    # Sorted by severity alone: findings of one severity stay in the order of the plant.
     order = list(Severity)
     return _hinted_once(sorted(found, key=lambda each: order.index(each.severity)))
 
@@ -268,6 +269,7 @@ def _of_listener(plant: str, listener: Row) -> Iterator[StatusFinding]:
 
 def _of_engine(label: str, stations: Sequence[Row], now_s: float) -> Iterator[StatusFinding]:
     """Yield one finding for all stations that the engine runs no more."""
+    # All stations share the engine: one line says it, not one for each of them.
     if hung := [station for station in stations if is_hung(station)]:
         names = ", ".join(station["name"] for station in hung)
         of_all = "any station" if len(hung) == len(stations) > 1 else names

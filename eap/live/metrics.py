@@ -99,6 +99,7 @@ def _quantiles(key: str) -> ValueReader:
 
 def _present(key: str, known: Iterable[str]) -> ValueReader:
     """Return a reader of a state as one series for each *known* one: 1 of the present one."""
+    # A generator could be read once only.
     states = tuple(known)
 
     def read(row: Row) -> dict[str, int]:
@@ -122,6 +123,7 @@ def _gauge(name: str, text: str, *path: str, scale: float = 1) -> Family:
 
 
 def _slave_states(bus: Row) -> dict[str, int]:
+    # States without a slave are 0: a series that is missing raises no alert.
     counts = dict.fromkeys((*_STATES, "absent"), 0)
     for slave in bus["slaves"]:
         state = "absent" if slave.get("is_absent") else slave["state"]
@@ -377,6 +379,7 @@ class MetricsWriter:
         for families, labels, row in _rows(status):
             seen += 1
             lines = self._samples(families, labels, row)
+            # The rows come in the order of their importance: what is left out is the least.
             if len(lines) > left:
                 left_out += len(lines)
                 continue
@@ -447,6 +450,7 @@ def _rows(status: StatusReport) -> Iterator[_LabelledRow]:
 def _appliance_rows(
     appliance: ApplianceStatus, labels: _Labels, found: Iterable[StatusFinding]
 ) -> Iterator[_LabelledRow]:
+    # As above: severities without a finding are 0.
     counts = dict.fromkeys(map(str, Severity), 0)
     for finding in found:
         if finding.plant == appliance.plant:

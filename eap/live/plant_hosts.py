@@ -136,6 +136,7 @@ def link_to_hosts(plant: Plant, file: Path, *, local: bool = False) -> Iterator[
             if left := tuple(name for name in missing if name not in found):
                 away.append(AwayHost(host.name, left, why or "not running there"))
         clients |= remote
+        # In the order of the plant file, whoever answered first.
         order = [station.name for station in plant.stations if station.name in clients]
         plant = _as_installed(plant, file, remote)
         link = PlantLink(
@@ -178,6 +179,7 @@ def _addresses(plant: Plant, names: list[str]) -> Iterator[tuple[str, RemoteHost
             uri = port.interface
             if port.kind is not PortKind.EAP or uri.scheme not in {"udp", "tcp"} or not port.ams:
                 continue
+            # A port on every address names none by which its host is reached.
             if not IPv4Address(uri.host).is_unspecified:
                 yield station.name, RemoteHost(uri.host, NetId(station.net_id))
                 break
@@ -187,6 +189,7 @@ def _unfit(hello: Hello, plant: Plant) -> str:
     """Return why an appliance cannot be changed from here; empty if it can."""
     if hello.plant != plant.name:
         return f"it runs plant {hello.plant}"
+    # Records of the configuration are compatible from one release to the next.
     if not are_neighbours(hello.release, RELEASE):
         return (
             f"it runs release {hello.release or 'unknown'}, this eapctl is {RELEASE}: more than"

@@ -45,6 +45,7 @@ def merged_rows(rows: Iterator[ValueRow]) -> Iterator[tuple[int, list[ValueRow]]
     group: dict[int, ValueRow] = {}
     at_ns = -1
     for row in rows:
+        # Two rows of one source with the same time are two lines.
         if row.time_ns != at_ns or row.source in group:
             if group:
                 yield at_ns, list(group.values())
@@ -75,6 +76,7 @@ def write_csv(
     blank = [""] * (len(names) + 1)
     count = 0
     for at_ns, rows in merged_rows(recording.rows(window, plans.keys())):
+        # A station without a sample of that time leaves its cells empty.
         cells = blank.copy()
         cells[0] = str(at_ns)
         for row in rows:

@@ -140,6 +140,7 @@ def _recorded(recording: FramesFile, left_out: dict[str, str]) -> Iterator[Repla
             continue
         publisher, _, pds = found
         name = recording.interfaces[captured.interface]
+        # A frame is recorded where it was sent and where it was received: it is sent once.
         if taken_from.setdefault(publisher, name) != name:
             continue
         sender = senders.get(publisher)
@@ -193,6 +194,7 @@ def _made(recording: ValuesFile, left_out: dict[str, str]) -> Iterator[ReplayFra
     senders = senders_of(recording.published)
     last_ns: dict[int, int] = {}
     for row in recording.rows(ALL, {source for source, frames in plans.items() if frames}):
+        # Samples lie beside the times at which PDs were sent, by up to half a step.
         tolerance_ns = max(0, row.time_ns - last_ns.get(row.source, row.time_ns)) // 2
         last_ns[row.source] = row.time_ns
         for frame, pds in plans[row.source]:
@@ -246,6 +248,7 @@ def impersonate(
         raise ConfigError(f"--as: unknown station {station!r}{suggest(station, known)}")
     original = ""
     for frame in frames:
+        # One station cannot have the cycle counters of several.
         original = original or frame.sender.station
         if frame.sender.station != original:
             raise ConfigError(
@@ -283,6 +286,7 @@ class ReplayClock:
         if self._first_ns is None:
             self._start_ns = now_ns
         else:
+            # The next round begins one step behind the last frame, as if the recording went on.
             self._start_ns += round((self._span_ns + self._step_ns or _LONE_NS) / self._rate)
             self._is_first_of = set(self._cycles)
         self._first_ns = None
@@ -305,6 +309,7 @@ class ReplayClock:
         before = self._cycles.get(publisher)
         if before is not None and publisher in self._is_first_of:
             self._is_first_of.discard(publisher)
+            # Subscribers count a jump of the cycle counter as lost PDs.
             self._shifts[publisher] = (before + self._steps.get(publisher, 1) - recorded) & 0xFFFF
         cycle = (recorded + self._shifts.get(publisher, 0)) & 0xFFFF
         if before is not None and cycle != before:

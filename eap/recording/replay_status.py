@@ -90,6 +90,7 @@ class ReplayStatus(Closeable):
         stations = {each.station: None for each in plan.senders.values()}
         self.stations = [station_name(each) for each in stations]
         name = folder_name(self._plant)
+        # Two replays at once would send with one NetID, and subscribers would see both as losses.
         if ApplianceFolder(runtime_root() / name).is_alive():
             raise EnvironmentalError(
                 f"a replay of {plant} runs already: end it first (eapctl status shows its file)"

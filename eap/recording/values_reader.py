@@ -98,6 +98,7 @@ class ValuesFile:
         waiting: list[RawRow] = []
         newest = 0
         for chunk in self._content.chunks:
+            # The index tells it: a chunk that is not wanted is not even decompressed.
             if chunk.last_ns < low or chunk.first_ns > high or not chunk.counts.keys() & wanted:
                 continue
             for channel, sequence, time_ns, data, _ in self._content.messages(chunk):

@@ -100,6 +100,7 @@ class Guard:
         role = role_of_anonymous(section)
         self._anonymous = None if role is None else Principal("", role)
         self._hosts = {name.lower().rstrip(".") for name in ("localhost", *section.hosts)}
+        # The name of this computer is known without the plant file.
         self._hosts.add(os.uname().nodename.lower())
         self._proxy = section.proxy
         self._proxies = [
@@ -171,6 +172,7 @@ class Guard:
         """Return the refusal of a change that is forged, or may be, None for others."""
         if (answer := self.refuse_foreign(request)) is not None:
             return answer
+        # Pages of other sites send forms and plain text without a preflight, JSON only with one.
         if request.content_type != "application/json":
             return refusal(415, "expected Content-Type: application/json")
         if is_browser(request):
@@ -242,6 +244,7 @@ class Guard:
         if self._proxy is not None and (name := request.headers.get(self._proxy.header)):
             return self._identify_by_proxy(request, name)
         if token := request.cookies.get(COOKIE, ""):
+            # An expired session is as none: its browser gets the page of the login, not an error.
             found = self.sessions.find(token, time())
             if found is not None:
                 request[USER], request[TOKEN] = found, token
@@ -273,6 +276,7 @@ class Guard:
             login, separator, password = b64decode(encoded, validate=True).decode().partition(":")
         except ValueError:
             separator = ""
+        # Programs have no session: they send user and password with each request.
         if scheme.lower() != "basic" or not separator:
             return refusal(401, "expected Authorization: Basic")
         # Programs send the password with each request, and a check of it takes a tenth of a second

@@ -84,5 +84,6 @@ class Sessions:
     def _sign(self, user: str, body: bytes) -> str:
         known = self._users.get(user)
         password = known.password.encode() if known else b""
+        # A new password in the plant file ends the sessions of the old one.
         digest = hashlib.sha256(password).digest()
         return hmac.new(self._key, b"session " + digest + body, hashlib.sha256).hexdigest()

@@ -57,6 +57,7 @@ class WebSocketServer:
         if (refused := self._guard.refuse_foreign(request)) is not None:
             return refused
         host = self._guard.host_of(request)
+        # One host must not take all places.
         of_host = sum(1 for known, _ in self._open.values() if known == host)
         if len(self._open) >= MAX_CLIENTS or of_host >= MAX_PER_HOST:
             return refusal(503, "too many WebSockets are open")
@@ -80,6 +81,7 @@ class WebSocketServer:
                 await self._send(socket, msgspec.json.encode(welcome))
                 sending = group.create_task(self._send_all(socket, pending))
                 await self._receive(socket, pending)
+                # It would wait for messages for ever.
                 sending.cancel()
         except* (OSError, TimeoutError, RuntimeError):
             # The client has gone, or does not read: close() would wait for it.
