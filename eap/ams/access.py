@@ -173,6 +173,7 @@ class Grants:
     def may(self, service: AccessService) -> bool | None:
         """Return whether *service* is allowed; None if that depends on the object."""
         rules = self._by_service[service]
+        # Rules behind the first one for all objects never decide.
         whole = next((rule for rule in rules if not rule.objects), None)
         if whole is None:
             otherwise = self._is_this_host or service is AccessService.READ
@@ -541,6 +542,7 @@ class AccessFilter:
             request = parse_request(header.command, data[AmsHeader.SIZE :])
         except AdsRefusedError as exc:
             is_recorded = self.before_change is not None
+            # What cannot be read cannot be audited either: with a required audit it is refused.
             is_allowed_unread = grants.may(AccessService.RAW) and not is_recorded
             return (data, None) if is_allowed_unread else _refuse_unreadable(header, exc)
         decisions = tuple(map(grants.decide, request.operations))

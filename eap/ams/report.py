@@ -102,6 +102,7 @@ def report_route(
     round_trip_ns = None if hop_prober is None else hop_prober.round_trip_ns(route.hop)
     if obstacle is not None:
         return RouteReport(route, obstacle.state, obstacle.why, None, known, next_name)
+    # A probe measures the hop alone, a request also the service behind it.
     if round_trip_ns is None and known.answers:
         round_trip_ns = known.round_trip_ns
     is_up = known.is_answered or (hop_prober is not None and hop_prober.has_answered(route.hop))
@@ -153,6 +154,7 @@ def advise(
     if not error:
         return Advice(is_reached=True, text="answers")
     words = AdsError.words_of(error)
+    # Before all else: an error that only the target sends proves the whole path.
     if error in _ALIVE:
         return Advice(is_reached=True, text=f"is there; {words}")
     if is_own:

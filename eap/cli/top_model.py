@@ -318,6 +318,7 @@ class TopModel:
         slots: list[list[_Moment]] = [[] for _ in range(width)]
         for moment in history:
             ago = (self.report.at_ns - moment.at_ns) * width // MINUTE_NS
+            # The report of a clock that has a step may lie outside the minute.
             slots[width - 1 - min(max(ago, 0), width - 1)].append(moment)
         highest = max(moment.per_s for moment in history)
         return "".join(_bar(slot, highest) for slot in slots)
@@ -332,6 +333,7 @@ class TopModel:
 
     def _remember(self, key: StationKey, row: StationRow, at_ns: int) -> None:
         total = row.lost + row.late
+        # A counter that has gone back belongs to a plant that was started again.
         trouble = max(total - self._totals.get(key, total), 0)
         self._totals[key] = total
         if row.tx_per_s is None and row.rx_per_s is None:
@@ -380,6 +382,7 @@ def _sorted(rows: list[AnyRowT], key: str) -> list[AnyRowT]:
         value = getattr(row, key)
         if isinstance(value, str):
             return False, value
+        # Numbers from the highest: what is worst is on the screen.
         return value is None, 0 if value is None else -value
 
     return sorted(rows, key=order)
@@ -390,6 +393,7 @@ def _bar(slot: Sequence[_Moment], highest: float) -> str:
         return " "
     if any(moment.trouble for moment in slot):
         return _LOSSY
+    # The least, so that a pause within a slot is seen.
     per_s = min(moment.per_s for moment in slot)
     if not per_s or not highest:
         return _SILENT

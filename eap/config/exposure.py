@@ -64,6 +64,7 @@ def find_exposures(index: Index, report: FindingReport, folder: Path) -> tuple[E
         Exposure(report.file, report.line_of(path), "CR 1.5", message, "chmod 600")
         for path, message in _readable_files(index, folder)
     ]
+    # Several rules may find the same place: it is shown once.
     return tuple(sorted(dict.fromkeys(found), key=lambda each: each.line))
 
 
@@ -97,6 +98,7 @@ def _writing(index: Index) -> Iterator[Found]:
     """Rules that let hosts write by what any sender can claim."""
     for station in index.plant.stations:
         for number, rule in enumerate(station.access):
+            # A rule that denies lets nothing through.
             services = set(parse_services(rule.allow, allows=True)) if rule.allow else set()
             writes = ALL in rule.allow or services - {AccessService.READ}
             if rule.allow and writes and not (rule.networks or rule.roles):
@@ -362,5 +364,6 @@ def _is_loopback(host: str) -> bool:
 
 def _denies_the_rest(rule: AccessSection) -> bool:
     """Return whether a rule denies everything to all that no rule before it let through."""
+    # Only a rule for every client is the last word.
     is_general = not (rule.networks or rule.net_ids or rule.to or rule.objects or rule.roles)
     return is_general and ALL in rule.deny

@@ -102,6 +102,7 @@ def _check_addresses(hosts: Sequence[HostSection], report: FindingReport) -> Non
                     expected = ADDRESS if is_first else _NETWORK
                     report.add(path, f"{text!r} is no address of host {host.name}", expected)
                 continue
+            # Other hosts connect to the first one: it has to be a single address.
             if is_first and "/" in text:
                 report.add(path, f"{text!r} is a network", ADDRESS)
                 continue
@@ -109,6 +110,7 @@ def _check_addresses(hosts: Sequence[HostSection], report: FindingReport) -> Non
             if network.is_loopback:
                 continue
             for other, owner in owners:
+                # Two hosts with one address answer for each other, and frames go to either of them.
                 if owner is not host and network.overlaps(other):
                     message = f"{text} of host {host.name} is an address of host {owner.name}, too"
                     report.add(path, message, "addresses of its own for each host")
@@ -257,6 +259,7 @@ def _check_servers(index: Index, report: FindingReport) -> None:
             address = IPv4Address(server.listen.host)
         except ValueError:
             continue  # IPv6: the plant file does not say whose address it is
+        # Each host has these: the server runs on all of them.
         if server.listen.is_any or server.listen.is_loopback:
             continue
         if not any(has_address(host, address) for host in index.plant.hosts):
@@ -315,6 +318,7 @@ def find_host(
             raise ConfigError(f"plant {plant} has no host {wanted!r}{hint}")
         return known[wanted]
     every = map(IPv4Address, addresses)
+    # Every computer has the loopback addresses: they tell none from the others.
     outside = [each for each in every if not each.is_loopback]
     found = {}
     for host in hosts:

@@ -231,6 +231,7 @@ class ObserverFeed:
             if packet is None:
                 return
             path = _tagged(frame_path(packet), tci)
+            # Source addresses can be invented: the memory of paths is bounded.
             if len(self._paths) >= _MAX_PATHS:
                 self._paths.clear()
             self._paths[head, tci] = path
@@ -287,6 +288,7 @@ def _compare(key: ObservedPdKey, takers: Iterable[Taker]) -> tuple[str | None, l
             taking.append(each.name)
         elif reason is None:
             refusing.append(RefusedBy(each.name, NOT_REACHED))
+        # A PD of another publisher that does not even arrive there is no near miss.
         elif reason is not PdDropReason.WRONG_PUBLISHER or each.is_reached(key):
             refusing.append(RefusedBy(each.name, reason.value))
     return ", ".join(taking) or None, [] if taking else refusing
@@ -341,6 +343,7 @@ def complete(
             found.append(row)
             continue
         variables = None
+        # Names of another layout would stand beside the wrong bytes.
         if (known.version, known.length) == (row.version, row.length):
             variables = _variables(known)
         else:
@@ -406,6 +409,7 @@ class Taker(NamedTuple):
     def refusal(self, pd: ObservedPdKey) -> PdDropReason | None:
         """Return the reason for which this subscription drops *pd*, None if it takes it."""
         wanted = self.subscription
+        # In the order in which a subscriber checks a PD, so that the reason is that of its counter.
         if wanted.publisher and NetId.parse(wanted.publisher) != pd.publisher:
             return PdDropReason.WRONG_PUBLISHER
         if (pd.version, pd.length) in self.layouts:
@@ -429,6 +433,7 @@ class Taker(NamedTuple):
         host, _, number = pd.destination.partition(":")
         if int(number or EAP_PORT) != (uri.port or EAP_PORT):
             return False
+        # Which groups a host has joined cannot be seen from outside.
         is_group = pd.destination_kind != "unicast"
         return is_group or uri.host in {host, "0.0.0.0"}  # noqa: S104  a comparison
 

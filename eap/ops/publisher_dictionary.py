@@ -82,6 +82,7 @@ def published_pds(device: OdDevice, net_id: str) -> Iterator[PublishedPd]:
         pdo = reader.number(index, Tx.PDO_INDEX)
         if pd_id is None:
             continue
+        # Without a usable number, the PDO of the same position is the likely one.
         if pdo is None or pdo not in _TX_PDOS:
             pdo = _TX_PDOS[0] + index - _TX_PDS.start
         variables = reader.variables(pdo)
@@ -128,6 +129,7 @@ class _PublisherReader:
             return None
         found: list[tuple[str, DataType]] = []
         begin = end = gaps = 0
+        # A device may claim any count.
         for subindex in range(1, min(count, MAX_ENTRIES) + 1):
             mapping = self.number(pdo, subindex)
             if mapping is None:

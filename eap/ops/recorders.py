@@ -107,6 +107,7 @@ def running_names(*, stoppable: bool = False) -> list[str]:
 
 
 def _require_packages(options: RecorderOptions) -> None:
+    # pcapng needs no package; a ring of frames is compressed.
     needed = _NEEDED if options.kind == "values" else _NEEDED[1:] if options.ring_ns else ()
     missing = [name for name in needed if find_spec(name) is None]
     if missing:
@@ -146,6 +147,7 @@ def _find_plant(
 def _check_names(folder: ApplianceFolder, info: ApplianceInfo, options: RecorderOptions) -> None:
     images: dict[str, Image] = {}
     for station in info.stations:
+        # Wrong names are found while a person waits, not in the log of a recorder.
         with open_image(folder.image(station)) as file:
             images[station] = file.image
     layouts = [image.layout for image in images.values()]
@@ -182,6 +184,7 @@ def _spawn(options: RecorderOptions) -> RecordingState:
     command = [sys.executable, "-m", "eap.recording.process"]
     paths = os.pathsep.join(filter(None, (_ROOT, _given_path())))
     environment = os.environ | {"PYTHONPATH": paths, STORE_VARIABLE: options.to}
+    # Every user of the host can read command lines: the password goes by the environment.
     options = msgspec.structs.replace(options, to=shown_url(options.to))
     process = subprocess.Popen(  # noqa: S603  our own module
         [*command, msgspec.json.encode(options).decode()],

@@ -252,6 +252,7 @@ class PlantAddressSpace:
         """Describe a node anew; its monitored items stay."""
         node_id = self.node_id(node.node_id)
         value = self._space[node_id].attributes.get(_A.Value)
+        # Members below it stay, with their monitored items.
         below = [
             each
             for each in self._space[node_id].references
@@ -300,6 +301,7 @@ class PlantAddressSpace:
             number = unit_id(node.unit)
             unit = ua.EUInformation()
             unit.NamespaceUri = self._own_uri if number is None else NAMESPACE
+            # OPC 10000-8: -1 where there is no unitId.
             unit.UnitId = -1 if number is None else number
             unit.DisplayName = unit.Description = ua.LocalizedText(node.unit)
             self._add_property(node.node_id, _UNIT, ua.ObjectIds.EUInformation, unit)
@@ -400,6 +402,7 @@ class PlantAddressSpace:
 
     def _add_enum_names(self, definition: Definition) -> None:
         names = [name for _, name in definition.names]
+        # EnumStrings is for numbers from 0 without gaps (OPC 10000-3).
         if [number for number, _ in definition.names] == list(range(len(names))):
             texts = [ua.LocalizedText(name) for name in names]
             self._add_property(
@@ -440,6 +443,7 @@ def data_value(
         node_id: Returns the NodeId of an identifier.
     """
     now = datetime.now(UTC)
+    # A value that never came has no time.
     made = datetime.fromtimestamp(sample.time_ns / 1e9, UTC) if sample.time_ns else now
     status = _STATUS[sample.quality]
     if sample.quality is Quality.BAD:
@@ -516,6 +520,7 @@ def _variable_type(node: VariableNode) -> int:
     is_number = node.type.built_in not in {
         BuiltIn.BOOLEAN, BuiltIn.STRING, BuiltIn.BYTESTRING, BuiltIn.EXTENSION_OBJECT
     }  # fmt: skip
+    # Analog items are numbers (OPC 10000-8).
     if is_number and (node.unit or node.limits):
         return int(ua.ObjectIds.BaseAnalogType)
     return int(ua.ObjectIds.BaseDataVariableType)

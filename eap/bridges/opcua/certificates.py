@@ -60,6 +60,8 @@ def own_certificate(folder: Path, plant: str, hosts: list[str]) -> OwnCertificat
         kept = given_certificate(folder / _CERTIFICATE, folder / _KEY, plant)
     except EnvironmentalError:
         kept = None
+    # A new host name or plant makes the URI another one, which clients compare with the
+    # certificate.
     is_valid = kept is not None and kept.certificate.not_valid_after_utc > datetime.now(UTC)
     if kept is not None and is_valid and kept.application_uri == uri:
         return kept
@@ -108,6 +110,7 @@ def _make(key: rsa.RSAPrivateKey, uri: str, plant: str, hosts: list[str]) -> x50
     now = datetime.now(UTC)
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"eap {plant}"[:64])])
     names: list[x509.GeneralName] = [x509.UniformResourceIdentifier(uri)]
+    # Clients compare the host that they connect to with these names.
     for host in dict.fromkeys((*hosts, socket.gethostname(), "localhost")):
         try:
             names.append(x509.IPAddress(ip_address(host)))
@@ -131,6 +134,7 @@ def _make(key: rsa.RSAPrivateKey, uri: str, plant: str, hosts: list[str]) -> x50
         .issuer_name(name)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
+        # The clocks of clients may be behind.
         .not_valid_before(now - timedelta(days=1))
         .not_valid_after(now + timedelta(days=365 * _YEARS))
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
@@ -212,6 +216,7 @@ def _trusts(certificate: x509.Certificate) -> Callable[[x509.Certificate], bool]
             return True
         try:
             constraints = trusted.extensions.get_extension_for_class(x509.BasicConstraints)
+            # Another client that is trusted must not issue certificates.
             if not constraints.value.ca:
                 return False
             certificate.verify_directly_issued_by(trusted)

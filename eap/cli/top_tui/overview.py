@@ -211,6 +211,7 @@ class OverviewScreen(FilteredScreen):
         if self._is_paused:
             notes.insert(0, "PAUSED")
         right = f" {' '.join(notes)} "
+        # The notes on the right stay: they say that the figures are not all.
         text.truncate(self.size.width - len(right), overflow="ellipsis", pad=True)
         text.append(right, "bold" if len(notes) > 1 else "")
         self.query_one("#head", Static).update(text)
@@ -222,6 +223,7 @@ class OverviewScreen(FilteredScreen):
             for tab, name in TABS.items()
         ]
         if self._model.match:
+            # A bracket would begin markup.
             match = self._model.match.replace("[", "")
             parts.append(f"[@click=screen.filter()] Filter: {match} [/]")
         self.query_one("#views", Static).update("".join(parts))
