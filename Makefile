@@ -48,7 +48,7 @@ test: setup  ## run all tests of the product; as root, first install the program
 	@$(PYTEST) --ignore=tests/tools --ignore=tests/package $(ARGS)
 
 test-pure: setup  ## run the tests of the cyclic path without its compiled part
-	@EAP_PURE=1 $(PYTEST) tests/unit/eap/pd tests/unit/eap/net $(ARGS)
+	@EAP_PURE=1 $(PYTEST) tests/unit/eap/pd tests/unit/eap/net tests/unit/eap/engine tests/unit/devicebus $(ARGS)
 
 test-tools: setup  ## run the tests of tools/: fuzz targets, page of faults, benchmarks
 	@$(PYTEST) tests/tools $(ARGS)

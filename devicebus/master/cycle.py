@@ -9,15 +9,31 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from enum import Enum, auto
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
 from devicebus.master.cyclicframe import CyclicExchange, PreparedFrame, prepare_frames
 from devicebus.master.image import BusImage, DatagramGroup, SlaveLayout
 from devicebus.master.link import Link
+from devicebus.master.quietcycle import QuietPlan, QuietWord, compile_frame, make_words
 from devicebus.wire.datagram import OVERHEAD, Command, DatagramRequest, logical
 from devicebus.wire.register import SmStatus
+from eap.codec.wire import Buffer
+
+(_CYCLES, _GOOD, _RECEIVED_WKC, _TRIP_NS, _MAX_TRIP_NS, _IS_GOOD) = map(
+    int,
+    (
+        QuietWord.CYCLES,
+        QuietWord.GOOD,
+        QuietWord.RECEIVED_WKC,
+        QuietWord.TRIP_NS,
+        QuietWord.MAX_TRIP_NS,
+        QuietWord.IS_GOOD,
+    ),
+)
+_U64 = (1 << 64) - 1
+_UNTIL_NS, _INDEX = int(QuietWord.UNTIL_NS), int(QuietWord.INDEX)
 
 # More cycles in flight would only delay the later ones, and acyclic frames too.
 MAX_UNDER_WAY = 2
@@ -88,7 +104,7 @@ class Cycle:
         on_fault: Called with the time when a cycle does not come back as expected.
 
     Attributes:
-        is_good: True if the last cycle has come back with the expected working counters.
+        words: Counters and state that the compiled part shares.
         note_time: Called with the time that the first extra datagram brought, and the present one.
     """
 
@@ -115,16 +131,17 @@ class Cycle:
         self._expected = 0
         for number in range(len(self._members)):
             self._update_expected(number)
-        self.is_good = False
+        self.words = make_words()
+        self._compiled: tuple[Any, Any] | None = None
+        self._is_compiled = False
+        self._sent_looks = False
+        self._under_way: deque[CyclicExchange] = deque()
+        self._newest = 0
+        self._wkc_errors = self._late = self._lost = self._skipped = 0
         self._extra: Sequence[DatagramRequest] = ()
         self._looks: Sequence[DatagramRequest] = ()
         self._note_full: Callable[[int, int], None] | None = None
         self._prepare()
-        self._under_way: deque[CyclicExchange] = deque()
-        self._newest = 0
-        self._cycles = self._good = self._wkc_errors = 0
-        self._late = self._lost = self._skipped = 0
-        self._received = self._trip_ns = self._max_trip_ns = 0
 
     @property
     def extra(self) -> Sequence[DatagramRequest]:
@@ -159,6 +176,8 @@ class Cycle:
 
     def _prepare(self) -> None:
         """Prepare the frames of the next cycles; those that are under way stay as they are."""
+        self._link.end_quiet()
+        self._is_compiled = False
         requests = [*map(self._request, self._datagrams), *self._extra]
         self._frames = prepare_frames(requests)
         self._looking = prepare_frames([*requests, *self._looks]) if self._looks else self._frames
@@ -179,6 +198,8 @@ class Cycle:
     def set_participation(self, station: int, participation: Participation) -> None:
         """Change the participation of a slave."""
         if station in self._participation and self._participation[station] is not participation:
+            self._link.end_quiet()
+            self._is_compiled = False
             self._participation[station] = participation
             self._update_expected(self._image.layout.slaves[station].group)
 
@@ -187,9 +208,15 @@ class Cycle:
         return self._participation.get(station, Participation.ABSENT)
 
     @property
+    def is_good(self) -> bool:
+        """True if the last cycle has come back with the expected working counters."""
+        return self.words[_IS_GOOD] != 0
+
+    @property
     def is_full(self) -> bool:
         """True if the last cycle came back with the full working counter of all active slaves."""
-        return self.is_good and self._received >= self._expected > 0
+        words = self.words
+        return words[_IS_GOOD] != 0 and words[_RECEIVED_WKC] >= self._expected > 0
 
     def is_expected(self, address: int, wkc: int) -> bool | None:
         """Return whether a datagram may have this working counter; None for another address."""
@@ -212,26 +239,101 @@ class Cycle:
         outputs = self._image.outputs
         for octets, where, what in self._writes:
             octets[where] = outputs[what]
-        self._cycles += 1
-        self.is_good = False
+        words = self.words
+        words[_CYCLES] += 1
+        words[_IS_GOOD] = 0
+        self._link.submit_cycle(self._begin_exchange(now_ns, looks=looks))
+
+    def _begin_exchange(self, now_ns: int, *, looks: bool) -> CyclicExchange:
         frames = self._looking if looks else self._frames
-        exchange = CyclicExchange(frames, self._cycles, now_ns, self._allowed, self._finish)
-        self._link.submit_cycle(exchange)
-        under_way.append(exchange)
+        number = self.words[_CYCLES]
+        exchange = CyclicExchange(frames, number, now_ns, self._allowed, self._finish)
+        self._under_way.append(exchange)
+        return exchange
+
+    def is_quiet(self, now_ns: int) -> bool:
+        """Return whether :meth:`quiet_frame` has the frame of this cycle."""
+        return self.words[_INDEX] < 0 and now_ns < self.words[_UNTIL_NS]
+
+    def begin_quiet(self, until_ns: int) -> bool:
+        """Have the compiled part exchange cycles until *until_ns*; return false if it cannot."""
+        if not self._is_compiled:
+            self._is_compiled = True
+            self._compiled = self._compile()
+        if self._compiled is None or not self._link.begin_quiet(self):
+            return False
+        self.words[_UNTIL_NS] = until_ns
+        return True
+
+    def quiet_frame(self, now_ns: int, *, looks: bool) -> bytes | None:
+        """Return the frame of a quiet cycle, to be sent now; None if it is not quiet any more."""
+        assert self._compiled is not None  # noqa: S101  it is quiet
+        self._sent_looks = looks
+        frame: bytes | None = self._compiled[looks].send(now_ns)
+        return frame
+
+    def receive_quiet(self, data: Buffer, now_ns: int) -> bool:
+        """Take the frame of a quiet cycle; return false, with nothing changed, for any other."""
+        assert self._compiled is not None  # noqa: S101  it is quiet
+        outcome = self._compiled[self._sent_looks].receive(data, now_ns)
+        if outcome > 1:
+            words = self.words
+            if words[QuietWord.HAS_TIME] and self.note_time is not None:
+                self.note_time(words[QuietWord.TIME_NS] & _U64, now_ns)
+            full = words[QuietWord.FULL]
+            for number in range(full.bit_length()):
+                if full >> number & 1 and self._note_full is not None:
+                    self._note_full(number, now_ns)
+        return bool(outcome)
+
+    def take_over(self, sent_ns: int) -> CyclicExchange:
+        """Return the exchange of the quiet cycle whose frame is under way, as start() makes it."""
+        return self._begin_exchange(sent_ns, looks=self._sent_looks)
+
+    def _compile(self) -> tuple[Any, Any] | None:
+        """Return the frames for quiet cycles, without and with looks; None if there are none."""
+        is_one = len(self._frames) == len(self._looking) == 1
+        is_exact = all(counts & counts - 1 == 0 for counts in self._allowed)
+        if not (is_one and is_exact and all(self._all_active)):
+            return None
+        image = self._image
+        writes, reads, counters = [], [], []
+        for datagram, (_, start, end), counts in zip(
+            self._datagrams, self._replies, self._allowed, strict=True
+        ):
+            group = image.layout.groups[datagram.group]
+            counters.append((end, counts.bit_length() - 1))
+            if datagram.command is not Command.LRD:
+                writes.append((start, group.outputs, group.outputs_size))
+                start += group.outputs_size  # noqa: PLW2901  inputs follow outputs in an LRW
+            if datagram.command is not Command.LWR:
+                reads.append((start, group.inputs, group.inputs_size))
+        time_at = -1
+        if self.note_time is not None:
+            time_at = next((start for _, start, _ in self._extra_replies), -1)
+        looks = [start for _, start, _ in self._look_replies]
+        plain = QuietPlan(writes, reads, counters, (), time_at)
+        plans = (self._frames[0], plain), (self._looking[0], plain._replace(looks=looks))
+        first, second = (
+            compile_frame(frame, plan, self.words, image.outputs, image.inputs)
+            for frame, plan in plans
+        )
+        return None if first is None else (first, second)
 
     def stats(self) -> CycleStats:
         """Return a snapshot of the counters."""
+        words = self.words
         return CycleStats(
-            cycles=self._cycles,
-            good=self._good,
+            cycles=words[_CYCLES],
+            good=words[_GOOD],
             wkc_errors=self._wkc_errors,
             late=self._late,
             lost=self._lost,
             skipped=self._skipped,
             expected_wkc=self._expected,
-            received_wkc=self._received,
-            trip_ns=self._trip_ns,
-            max_trip_ns=self._max_trip_ns,
+            received_wkc=words[_RECEIVED_WKC],
+            trip_ns=words[_TRIP_NS],
+            max_trip_ns=words[_MAX_TRIP_NS],
         )
 
     def _request(self, datagram: _CyclicDatagram) -> DatagramRequest:
@@ -258,9 +360,10 @@ class Cycle:
             self._lost += 1
             return
         self._late += exchange.is_overdue
-        self._trip_ns = trip_ns = now_ns - exchange.begun_ns
-        if trip_ns > self._max_trip_ns:  # noqa: PLR1730  max() takes five times as long
-            self._max_trip_ns = trip_ns
+        words = self.words
+        words[_TRIP_NS] = trip_ns = now_ns - exchange.begun_ns
+        if trip_ns > words[_MAX_TRIP_NS]:  # noqa: PLR1730  max() takes five times as long
+            words[_MAX_TRIP_NS] = trip_ns
         if exchange.number > self._newest:  # an overdue frame may be overtaken
             self._newest = exchange.number
             self._handle_replies(exchange, now_ns)
@@ -279,10 +382,10 @@ class Cycle:
                 self._copy_inputs(datagram, data, start)
             else:
                 is_good = False
-        self._received = received
-        self.is_good = is_good
+        self.words[_RECEIVED_WKC] = received
+        self.words[_IS_GOOD] = is_good
         if is_good:
-            self._good += 1
+            self.words[_GOOD] += 1
         else:
             self._wkc_errors += 1
             self._on_fault(now_ns)

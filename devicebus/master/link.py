@@ -16,9 +16,10 @@ budget and one frame more, whatever is queued.
 
 from __future__ import annotations
 
+from array import array
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import msgspec
 
@@ -32,6 +33,7 @@ from devicebus.master.cyclicframe import (
     encode_datagrams,
     encode_header,
 )
+from devicebus.master.quietcycle import QuietWord
 from devicebus.wire.datagram import (
     OVERHEAD,
     Command,
@@ -83,6 +85,20 @@ class RoundTrip:
         self._variation_ns = 0
         self.smoothed_ns = 0
         self.timeout_ns = self._backoff_limit_ns
+
+    def save(self, words: array[int]) -> None:
+        """Store the estimate for quiet cycles."""
+        words[QuietWord.TIMEOUT_NS] = self.timeout_ns
+        words[QuietWord.SMOOTHED_NS] = self.smoothed_ns
+        words[QuietWord.VARIATION_NS] = self._variation_ns
+        words[QuietWord.FLOOR_NS] = self._floor_ns
+        words[QuietWord.CEILING_NS] = self._ceiling_ns
+
+    def load(self, words: array[int]) -> None:
+        """Take the estimate that quiet cycles have made."""
+        self.timeout_ns = words[QuietWord.TIMEOUT_NS]
+        self.smoothed_ns = words[QuietWord.SMOOTHED_NS]
+        self._variation_ns = words[QuietWord.VARIATION_NS]
 
     def timeout_of(self, number: int, last: int) -> int:
         """Return the time-out of attempt *number* of *last*.
@@ -232,6 +248,18 @@ class _SentFrame:
         self.deadline_ns = deadline_ns
 
 
+class QuietCycles(Protocol):
+    """Cycle that sends and receives its frames without the link while nothing else is under way."""
+
+    words: array[int]
+
+    def receive_quiet(self, data: Buffer, now_ns: int) -> bool:
+        """Take the frame of a quiet cycle; return false, with nothing changed, for any other."""
+
+    def take_over(self, sent_ns: int) -> CyclicExchange:
+        """Return the exchange of the frame that is under way."""
+
+
 class Link:
     """Link to the segment.
 
@@ -262,6 +290,7 @@ class Link:
         self._acyclic: deque[_QueuedDatagram] = deque()
         self._in_flight: dict[int, _SentFrame] = {}
         self._overdue: dict[int, _SentFrame] = {}  # the oldest first
+        self._quiet: QuietCycles | None = None
         self._acyclic_in_flight = 0
         self._index = 0
         self._spent = self._max_spent = 0
@@ -278,6 +307,7 @@ class Link:
         """
         if not datagrams or max(len(datagram.data) for datagram in datagrams) > MAX_DATA:
             raise ValueError(f"no datagram, or one with more than {MAX_DATA} bytes")
+        self.end_quiet()
         exchange = Exchange(len(datagrams), done)
         tries = self._tries
         self._acyclic.extend(
@@ -301,6 +331,7 @@ class Link:
 
     def start_cycle(self) -> None:
         """Begin a cycle: refill the budget, less the overdraft of the cycle before."""
+        self.end_quiet()
         self._max_spent = max(self._max_spent, self._spent)
         self._spent = 0
         credit = self._credit or 0
@@ -309,12 +340,14 @@ class Link:
 
     def stop_cycles(self) -> None:
         """End the cyclic operation: acyclic datagrams are sent without a budget."""
+        self.end_quiet()
         self._credit = None
         self._spent = 0
 
     def frames_to_send(self, now_ns: int) -> list[bytes]:
         """Return the frames to send now."""
         frames: list[bytes] = []
+        # A quiet time goes on: nothing is queued in it.
         while self._cyclic and len(self._in_flight) < self._indexes:
             frames.append(self._send_cyclic(self._cyclic.popleft(), now_ns))
         while self._may_send_acyclic():
@@ -327,6 +360,11 @@ class Link:
 
     def receive_frame(self, data: Buffer, now_ns: int) -> None:
         """Handle a frame that came back; one that answers nothing is counted."""
+        if self._quiet is None or not self._quiet.receive_quiet(data, now_ns):
+            self.end_quiet()
+            self._receive_frame(data, now_ns)
+
+    def _receive_frame(self, data: Buffer, now_ns: int) -> None:
         # Index of the first datagram; all datagrams of a frame carry the same one.
         index = data[3] if len(data) > EtherCatHeader.SIZE + DatagramHeader.SIZE else -1
         sent = self._in_flight.get(index)
@@ -336,10 +374,7 @@ class Link:
             if sent is None:
                 self._unexpected += 1
                 return
-        cyclic = sent.cyclic
-        offset = EtherCatHeader.SIZE if cyclic is None else cyclic.frame.size
-        is_ours = cyclic is None or cyclic.frame.matches(data, index)
-        results = _match(data, index, sent.items, offset) if is_ours else None
+        results = _match(data, index, sent)
         if results is None:
             self._malformed += 1
             return
@@ -351,8 +386,8 @@ class Link:
             self._end_flight(index)
         # Karn's rule is not needed: each transmission has its own index (see RoundTrip).
         self._round_trip.measure(now_ns - sent.sent_ns)
-        if cyclic is not None:
-            cyclic.exchange.take(cyclic.number, bytes(data), now_ns)
+        if sent.cyclic is not None:
+            sent.cyclic.exchange.take(sent.cyclic.number, bytes(data), now_ns)
         for item, (reply, wkc) in zip(sent.items, results, strict=True):
             if item.is_over:
                 continue
@@ -366,14 +401,18 @@ class Link:
     @property
     def is_waiting(self) -> bool:
         """True while a frame may come back."""
+        if self._quiet is not None:
+            return self._quiet.words[QuietWord.INDEX] >= 0
         return bool(self._in_flight or self._overdue)
 
     def next_timeout(self) -> int | None:
         """Return the time at which the next frame in flight is overdue."""
+        self.end_quiet()
         return min([sent.deadline_ns for sent in self._in_flight.values()], default=None)
 
     def handle_timeout(self, now_ns: int) -> None:
         """Repeat or fail the datagrams of overdue frames."""
+        self.end_quiet()
         while self._overdue:
             index, oldest = next(iter(self._overdue.items()))
             if now_ns - oldest.deadline_ns < LINGER_NS:
@@ -397,6 +436,7 @@ class Link:
 
     def stats(self) -> LinkStats:
         """Return a snapshot of the counters."""
+        self.end_quiet()
         return LinkStats(
             sent=self._sent,
             received=self._received,
@@ -409,6 +449,41 @@ class Link:
             round_trip_ns=self._round_trip.smoothed_ns,
             max_acyclic_octets=max(self._max_spent, self._spent),
         )
+
+    def begin_quiet(self, cycle: QuietCycles) -> bool:
+        """Begin a cycle that *cycle* exchanges without the link, and those behind it.
+
+        Returns false if a datagram or a frame waits or is under way, or no budget is left.
+        """
+        is_idle = not (self._cyclic or self._acyclic or self._in_flight or self._overdue)
+        if not is_idle or self._credit is None or self._credit <= 0:
+            return False
+        self.start_cycle()
+        words = cycle.words
+        words[QuietWord.NEXT_INDEX], words[QuietWord.INDEXES] = self._index, self._indexes
+        words[QuietWord.SENT] = words[QuietWord.BACK] = 0
+        self._round_trip.save(words)
+        self._quiet = cycle
+        return True
+
+    def end_quiet(self) -> None:
+        """Take the frame and the counters of quiet cycles over, if there are any."""
+        cycle, self._quiet = self._quiet, None
+        if cycle is None:
+            return
+        words = cycle.words
+        words[QuietWord.UNTIL_NS] = 0
+        self._index = words[QuietWord.NEXT_INDEX]
+        self._sent += words[QuietWord.SENT]
+        self._received += words[QuietWord.BACK]
+        self._round_trip.load(words)
+        index, words[QuietWord.INDEX] = words[QuietWord.INDEX], -1
+        if index >= 0:
+            sent_ns = words[QuietWord.SENT_NS]
+            exchange = cycle.take_over(sent_ns)
+            part = _CyclicPart(exchange, 0, exchange.frames[0])
+            deadline_ns = sent_ns + self._round_trip.timeout_ns
+            self._in_flight[index] = _SentFrame(part, (), sent_ns, deadline_ns)
 
     def _may_send_acyclic(self) -> bool:
         return (
@@ -492,10 +567,14 @@ class Link:
         return sent
 
 
-def _match(
-    data: Buffer, index: int, items: Sequence[_QueuedDatagram], offset: int
-) -> Sequence[tuple[bytes, int]] | None:
-    """Return data and working counter of each item from *offset* on; None if they are others."""
+def _match(data: Buffer, index: int, sent: _SentFrame) -> Sequence[tuple[bytes, int]] | None:
+    """Return data and working counter of each item; None if *data* is another frame."""
+    offset = EtherCatHeader.SIZE
+    if sent.cyclic is not None:
+        if not sent.cyclic.frame.matches(data, index):
+            return None
+        offset = sent.cyclic.frame.size
+    items = sent.items
     if not items:
         return ()
     results = []

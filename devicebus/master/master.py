@@ -205,22 +205,52 @@ class Master:
         cycle = self._bus.cycle
         if cycle is None:
             return
-        self._cycles_to_look -= 1
-        looks = self._cycles_to_look < 0
+        looks = self._count_to_look(now_ns)
         if looks:
-            self._cycles_to_look = self._looks_every - 1
-            self._look_ns = now_ns + _LOOK_WITHOUT_CYCLES_NS
-            self._place_looks(cycle, now_ns)
+            self._place_looks(cycle)
+            # Those that do not fit have frames of their own.
+            if rest := self._looked_at[self._in_cycle :]:
+                self._look_into(rest, now_ns)
         cycle.start(now_ns, looks=looks)
 
-    def _place_looks(self, cycle: Cycle, now_ns: int) -> None:
-        """Have cycles look into the open mailboxes; those that do not fit have their own frames."""
+    def is_quiet(self, now_ns: int) -> bool:
+        """Return whether nothing but the frame of a cycle is to be sent, for quiet_frame()."""
+        cycle = self._bus.cycle
+        if cycle is None or self._bus.ring is not None:
+            return False
+        if not self._cycles_to_look and self._in_cycle < len(self._looked_at):
+            return False
+        return cycle.is_quiet(now_ns) or self._begin_quiet(cycle, now_ns)
+
+    def quiet_frame(self, now_ns: int) -> bytes | None:
+        """Return the frame of a quiet cycle; None if it must be started as others."""
+        cycle = self._bus.cycle
+        assert cycle is not None  # noqa: S101  it is quiet
+        return cycle.quiet_frame(now_ns, looks=self._count_to_look(now_ns))
+
+    def _begin_quiet(self, cycle: Cycle, now_ns: int) -> bool:
+        due_ns = self._bus.runner.next_timeout()
+        until_ns = self._errors_ns if due_ns is None else min(due_ns, self._errors_ns)
+        if now_ns >= until_ns or self.is_waiting:
+            return False
+        self._place_looks(cycle)
+        return cycle.begin_quiet(until_ns)
+
+    def _count_to_look(self, now_ns: int) -> bool:
+        """Count a cycle; return whether it looks into mailboxes."""
+        self._cycles_to_look -= 1
+        if self._cycles_to_look >= 0:
+            return False
+        self._cycles_to_look = self._looks_every - 1
+        self._look_ns = now_ns + _LOOK_WITHOUT_CYCLES_NS
+        return True
+
+    def _place_looks(self, cycle: Cycle) -> None:
+        """Have cycles look into the open mailboxes, as many as fit."""
         boxes = self._open_mailboxes()
         if boxes != self._looked_at or cycle is not self._look_cycle:
             self._looked_at, self._look_cycle = boxes, cycle
             self._in_cycle = cycle.set_looks([*map(status_read, boxes)], self._note_full)
-        if self._in_cycle < len(boxes):
-            self._look_into(boxes[self._in_cycle :], now_ns)
 
     def _note_full(self, number: int, now_ns: int) -> None:
         self._looked_at[number].poll(now_ns)

@@ -241,6 +241,7 @@ class Runner:
     def queue_step(self, run: _Run, step: Step, now_ns: int) -> None:
         """Queue the next step of a procedure."""
         if isinstance(step, Sleep):
+            self._link.end_quiet()  # it may not last until then
             entry = (now_ns + step.duration_ns, next(self._number), run)
             heapq.heappush(self._sleeping, entry)
         else:

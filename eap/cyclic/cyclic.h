@@ -107,7 +107,7 @@ int send_due(PyObject *plan, PyObject *publisher, PyObject *channel, PyObject *n
 extern PyTypeObject *plan_type, *handler_type, *receiver_type, *drain_type, *patch_type,
     *send_plan_type;
 extern PyType_Spec plan_spec, handler_spec, receiver_spec, drain_spec, patch_spec, send_plan_spec,
-    cycle_spec, waiter_spec;
+    cycle_spec, waiter_spec, cycle_frame_spec;
 extern PyObject *text_fast, *text_source, *text_source_of, *text_wanted, *text_direct, *text_send,
     *text_address_of, *text_plan;
 

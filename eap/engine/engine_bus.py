@@ -408,9 +408,11 @@ class EngineBus:
         self.fail_tasks(reason)
 
     def _exchange(self, now_ns: int) -> None:
-        self.master.handle_timeout(now_ns)
-        if self._retry_ns is not None and now_ns >= self._retry_ns:
-            self._start(now_ns)
+        is_quiet = not self._is_busy() and self.master.is_quiet(now_ns)
+        if not is_quiet:
+            self.master.handle_timeout(now_ns)
+            if self._retry_ns is not None and now_ns >= self._retry_ns:
+                self._start(now_ns)
         if self.master.image is not self._mapping.bus_image:
             self._mapping.lay_out(self.master.image)
             # A new bus image starts with zeros, which would reach the variables before the first
@@ -418,8 +420,12 @@ class EngineBus:
             self._mapping.keep_inputs()
         # The outputs of this cycle leave at its end; the inputs they cause come in the next one.
         self._mapping.put_outputs()
-        self.master.start_cycle(now_ns)
-        self._send(now_ns)
+        frame = self.master.quiet_frame(now_ns) if is_quiet else None
+        if frame is not None:
+            self._send_frame(self._port, frame)
+        else:
+            self.master.start_cycle(now_ns)
+            self._send(now_ns)
         if self._set_step is not None and self.master.lock is not None:
             self._set_step(self.master.lock.take_step())
         self.faults.now_ns = now_ns

@@ -106,7 +106,7 @@ def test_publisher_sends_all_slaves_to_another_receiver(rig, receiver, publisher
 
 
 def test_publisher_sends_expected_slaves_of_a_master_that_was_replaced(rig, receiver, publisher):
-    rig.bus.master.start_cycle = None
+    rig.bus.master.is_quiet = None
     rig.run(2 * MS)
     publisher.flush()
     assert "the master has failed" in receiver.messages[-1].fault
