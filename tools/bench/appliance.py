@@ -9,7 +9,9 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -25,6 +27,8 @@ from tools.bench.pacing import wait
 PROCESSES = ("supervisor", "engine", "services")
 _READY_WITHIN_S = 60.0
 _END_WITHIN_S = 10.0
+WINDOWS = 5
+"""Parts of an observation that processor time is counted in."""
 _WARM_UP_S = 2.0
 _EAPCTL = (sys.executable, "-m", "eap")
 
@@ -33,7 +37,8 @@ class Observation(msgspec.Struct, frozen=True):
     """Counters of an appliance over *seconds*.
 
     Attributes:
-        cpu: Share of one core of each process; those of segments are named after their buses.
+        cpu: Share of one core of each process, in the median of WINDOWS; those of segments are
+            named after their buses.
         kernel: Part of *cpu* that was spent in the kernel.
         rss: Octets of each process, likewise.
         lost: Frames lost, over all subscriptions.
@@ -99,11 +104,14 @@ def observe(plant: Path, seconds: float, link: Cable | None) -> Observation:
         wait(_WARM_UP_S)
         first = status(link, environment)
         pids = _pids(first["processes"])
-        before = {name: ProcessSample(pid) for name, pid in pids.items()}
-        wait(seconds)
-        after = {name: ProcessSample(pid) for name, pid in pids.items()}
+        samples = []
+        for number in range(WINDOWS + 1):
+            samples.append({name: ProcessSample(pid) for name, pid in pids.items()})
+            if number < WINDOWS:
+                wait(seconds / WINDOWS)
         last = status(link, environment)
-    cpu = {name: (after[name].cpu_ns - before[name].cpu_ns) / seconds / 1e9 for name in pids}
+    cpu = {name: _share([each[name] for each in samples], seconds) for name in pids}
+    before, after = samples[0], samples[-1]
     return Observation(
         seconds=seconds,
         cpu=cpu,
@@ -118,6 +126,12 @@ def observe(plant: Path, seconds: float, link: Cable | None) -> Observation:
             for key in ("p50", "p99", "max")
         },
     )
+
+
+def _share(samples: Sequence[ProcessSample], seconds: float) -> float:
+    """Return the share of a core in the median window, so that one burst does not decide."""
+    windows = [after.cpu_ns - before.cpu_ns for before, after in pairwise(samples)]
+    return median(windows) * WINDOWS / seconds / 1e9
 
 
 def share_figure(

@@ -49,8 +49,22 @@ def carry(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Let *way* send for so long; return the answers of its sender and of its receiver.
 
-    Publisher and subscriber have a core each, with *swap* the other one.
+    Publisher and subscriber have a core each, with *swap* the other one.  A run that fails is
+    tried once more, for the machine may have stood still.
+
+    Raises:
+        RuntimeError: a process ended without an answer, or frames were lost within a window, so
+            that the figures mean nothing.
     """
+    try:
+        return _carry(link, way, shape, seconds, swap=swap)
+    except RuntimeError:
+        return _carry(link, way, shape, seconds, swap=swap)
+
+
+def _carry(
+    link: Cable, way: Endpoint, shape: Shape, seconds: float, *, swap: bool
+) -> tuple[dict[str, Any], dict[str, Any]]:
     sending, receiving = machine.cores() if not swap else machine.cores()[::-1]
     folder = Path(link.folder)
     for left in (folder / "page", *folder.glob("*.image")):
@@ -75,4 +89,8 @@ def carry(
                 ends[0].answer()
         sent = ends[1].answer(seconds)
         page.words[Page.STOP] = 1
-        return sent, ends[0].answer()
+        received = ends[0].answer()
+    arrived = received.get("received")  # a receiver of stamps does not count
+    if way.window and arrived is not None and (arrived != sent["sent"] or received["lost"]):
+        raise RuntimeError(f"{way.send}: {sent} but {received}")
+    return sent, received

@@ -41,7 +41,7 @@ def reads(job: dict[str, Any]) -> None:
             trips.append(perf_counter_ns() - begin_ns)
     if back[_ABORT_AT] == _ABORT:
         raise RuntimeError(f"{job['address']} answers with {back.hex()}")
-    kept = trips[_COLD:]
+    kept = trips[_COLD:] or trips
     answer({"per_second": len(kept) / sum(kept) * 1e9, "trips": kept})
 
 

@@ -38,7 +38,7 @@ def kernel_share(before: ProcessSample, after: ProcessSample) -> float:
 
 
 def describe() -> str:
-    """Return one line: processors, kernel, Python with its build, and the compiled part."""
+    """Return one line: processors, kernel, Python and its build, the compiled part, the load."""
     info = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     models = [line.partition(":")[2].strip() for line in info.splitlines() if "model name" in line]
     model = models[0] if models else platform.machine()
@@ -46,7 +46,8 @@ def describe() -> str:
     return (
         f"{os.cpu_count()} cores of {model}{virtual}; Linux {os.uname().release}; "
         f"{platform.python_implementation()} {platform.python_version()}, {_build()}; "
-        f"cyclic path {'in Python' if cyclic is None else 'compiled'}"
+        f"cyclic path {'in Python' if cyclic is None else 'compiled'}; "
+        f"load before the run {os.getloadavg()[0]:.1f}"
     )
 
 
