@@ -5,16 +5,18 @@ from __future__ import annotations
 import asyncio
 import copy
 import hashlib
-from collections.abc import AsyncGenerator, AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
+from aiohttp import ClientResponse, ClientWebSocketResponse, encode_basic_auth
 from aiohttp.test_utils import TestClient, TestServer
+from msgspec.structs import replace
 
 from eap.ams.spec import Role
 from eap.config.passwords import PasswordHash
 from eap.config.users import AccountSection
-from eap.config.web_sections import WebPage, WebSection
+from eap.config.web_sections import SetPanel, TrendPanel, ValuePanel, WebPage, WebSection
 from eap.control.protocol import ErrorCode, ValuesEvent
 from eap.errors import ControlError
 from eap.live.client import LiveClient
@@ -43,7 +45,6 @@ class StubPlant:
         values: Present values.
         quality: Of those that are received.
         written: Parameters of all writes.
-        logins: Refused logins, as the page reports them.
         answers: False while it does not answer.
     """
 
@@ -52,7 +53,6 @@ class StubPlant:
         self.quality: dict[str, int | None] = {"far": 3}
         self.rx = rx("from-mill")
         self.written: list[dict[str, Any]] = []
-        self.logins: list[Any] = []
         self.answers = True
         self.cycle = 0
 
@@ -60,10 +60,6 @@ class StubPlant:
         if not self.answers:
             raise ControlError("it closed the connection", code=ErrorCode.UNAVAILABLE)
         return copy.deepcopy(getattr(self, f"_{method}")(params))
-
-    def _note_logins(self, params: dict[str, Any]) -> dict[str, Any]:
-        self.logins.extend(params["refused"])
-        return {"noted": len(params["refused"])}
 
     async def watch(self, wanted: ValuesSubscription) -> AsyncGenerator[ValuesEvent | ControlError]:
         while self.answers:
@@ -122,6 +118,19 @@ def page(*panels: Any, name: str = "Line") -> WebPage:
     return WebPage(name=name, panels=panels)
 
 
+OPEN = WebSection(
+    pages=(
+        page(
+            ValuePanel(of="mixer/*"),
+            TrendPanel(of="mixer/speed", window="10m"),
+            SetPanel(of="mixer/setpoint", low=10, high=90),
+        ),
+    )
+)
+CLOSED = replace(OPEN, users=USERS)
+SETPOINT = "/api/v1/mixer/setpoint"
+
+
 class Site:
     """The page's server of a stub plant, and clients of it."""
 
@@ -177,3 +186,45 @@ async def site(section: WebSection, plant: StubPlant | None = None) -> AsyncIter
             for client in found._clients:
                 await client.close()
             await test_server.close()
+
+
+def play(
+    script: Callable[[Site], Awaitable[None]],
+    section: WebSection = OPEN,
+    plant: StubPlant | None = None,
+) -> None:
+    """Run *script* on the page of a stub plant."""
+
+    async def run() -> None:
+        async with site(section, plant) as found:
+            await script(found)
+
+    asyncio.run(run())
+
+
+def basic(name: str, password: str) -> dict[str, str]:
+    """Return the header of a program that logs in with each request."""
+    return {"Authorization": encode_basic_auth(name, password)}
+
+
+async def reason(answer: ClientResponse) -> str:
+    """Return the message of a refusal."""
+    message: str = (await answer.json())["error"]["message"]
+    return message
+
+
+async def subscribed(client: TestClient[Any, Any], *topics: str) -> ClientWebSocketResponse:
+    """Open a WebSocket and subscribe it to *topics*."""
+    socket = await client.ws_connect("/api/v1/ws")
+    welcome = await socket.receive_json()
+    assert (welcome["type"], welcome["version"], welcome["plant"]) == ("welcome", 1, "line")
+    await socket.send_json({"subscribe": topics})
+    return socket
+
+
+async def of_type(socket: ClientWebSocketResponse, kind: str) -> dict[str, Any]:
+    """Return the next message of a type; others are skipped."""
+    message: dict[str, Any]
+    while (message := await socket.receive_json())["type"] != kind:
+        pass
+    return message

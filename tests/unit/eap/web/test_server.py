@@ -1,4 +1,4 @@
-"""The page's server by HTTP and WebSocket, on a plant without processes."""
+"""The page's server by HTTP, on a plant without processes: values, writes, files, connections."""
 
 from __future__ import annotations
 
@@ -6,61 +6,33 @@ import asyncio
 import json
 import ssl
 import subprocess
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from time import monotonic
 
 import pytest
-from aiohttp import WSMsgType, WSServerHandshakeError, encode_basic_auth
-from msgspec.structs import replace
 
-from eap.ams.spec import Role
-from eap.config.web_sections import (
-    CommentRule,
-    PicturePanel,
-    SetPanel,
-    TablePanel,
-    TrendPanel,
-    ValuePanel,
-    WebProxy,
-    WebSection,
-    WebTls,
-)
+from eap.config.web_sections import CommentRule, PicturePanel, SetPanel, WebSection, WebTls
 from eap.errors import EnvironmentalError
 from eap.live.view import LiveView
-from eap.runtime.logins import FREE_FAILURES
-from eap.web import guard, server, sockets
+from eap.web import guard, server
 from eap.web.process import session_key
-from tests.support.webplant import KEY, PASSWORD, USERS, Site, StubPlant, page, site, stub_client
+from tests.support.webplant import (
+    CLOSED,
+    KEY,
+    PASSWORD,
+    SETPOINT,
+    Site,
+    basic,
+    of_type,
+    page,
+    play,
+    reason,
+    stub_client,
+    subscribed,
+)
 
 pytestmark = pytest.mark.net
-
-SET = SetPanel(of="mixer/setpoint", low=10, high=90)
-PANELS = (ValuePanel(of="mixer/*"), TrendPanel(of="mixer/speed", window="10m"), SET)
-OPEN = WebSection(pages=(page(*PANELS),))
-CLOSED = replace(OPEN, users=USERS)
-SETPOINT = "/api/v1/mixer/setpoint"
-
-
-def play(
-    script: Callable[[Site], Awaitable[None]],
-    section: WebSection = OPEN,
-    plant: StubPlant | None = None,
-) -> None:
-    async def run() -> None:
-        async with site(section, plant) as found:
-            await script(found)
-
-    asyncio.run(run())
-
-
-def basic(name: str, password: str) -> dict[str, str]:
-    return {"Authorization": encode_basic_auth(name, password)}
-
-
-async def reason(answer) -> str:
-    return (await answer.json())["error"]["message"]
 
 
 def test_value_has_unit_quality_and_age():
@@ -111,19 +83,6 @@ def test_unknown_path_is_refused_with_a_reason(path, message):
         client = await found.client()
         async with client.get(path) as answer:
             assert (answer.status, await reason(answer)) == (404, message)
-
-    play(script)
-
-
-def test_stale_pd_makes_its_values_stale():
-    async def script(found: Site) -> None:
-        found.plant.rx["state"] = "stale"
-        client = await found.client()
-        socket = await subscribed(client, "values:mixer/far")
-        while (await of_type(socket, "values"))["values"]["mixer/far"][::2] != [7, True]:
-            pass
-        assert (await (await client.get("/api/v1/mixer/far")).json())["stale"]
-        assert not (await (await client.get("/api/v1/mixer/speed")).json())["stale"]
 
     play(script)
 
@@ -264,40 +223,6 @@ def test_write_with_a_wrong_body_is_refused(body):
     play(script)
 
 
-def test_password_that_is_no_text_is_refused():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        body, headers = (
-            r'{"user": "otto", "password": "\ud800"}',
-            {"Content-Type": "application/json"},
-        )
-        async with client.post("/api/v1/login", data=body, headers=headers) as answer:
-            assert answer.status == 400
-
-    play(script, CLOSED)
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["Host", "Origin", "Cookie", "Authorization", "X-CSRF-Token", "Content-Type", "X-Remote-User",
-     "X-Forwarded-For", "Sec-Fetch-Site"],
-)  # fmt: skip
-def test_header_that_is_no_text_is_no_defect(name):
-    async def script(found: Site) -> None:
-        client = await found.client()
-        reader, writer = await asyncio.open_connection(client.host, client.port)
-        given = {b"Host": b"localhost", b"Content-Type": b"application/json"}
-        given |= {name.encode(): b"eap-session=\xff" if name == "Cookie" else b"Basic http://\xff"}
-        lines = [b"POST /api/v1/mixer/setpoint HTTP/1.1", b"Content-Length: 11"]
-        lines += [b"%s: %s" % each for each in given.items()]
-        writer.write(b"\r\n".join([*lines, b"", b'{"value":1}']))
-        status = (await reader.readline()).split()[1]
-        assert status in {b"400", b"401", b"403", b"415", b"422"}
-        writer.close()
-
-    play(script, replace(CLOSED, anonymous=Role.VIEWER, proxy=WebProxy(header="X-Remote-User")))
-
-
 def test_write_of_a_form_is_refused():
     async def script(found: Site) -> None:
         client = await found.client()
@@ -318,261 +243,6 @@ def test_body_and_line_of_a_request_are_bounded():
             assert answer.status == 400
 
     play(script)
-
-
-def test_without_login_users_see_nothing():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        session = await (await client.get("/api/v1/session")).json()
-        assert (session["user"], session["role"], session["can_log_in"]) == (None, None, True)
-        for path in ("status", "plant", "pages", "variables", "events", "mixer/speed",
-                     "history/mixer/speed", "routes/mixer/", "pictures/0/0", "ws"):  # fmt: skip
-            async with client.get(f"/api/v1/{path}") as answer:
-                assert answer.status == 401, path
-        async with client.post(SETPOINT, json={"value": 50}) as answer:
-            assert answer.status == 401
-
-    play(script, CLOSED)
-
-
-def test_anonymous_viewer_sees_and_sets_nothing():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        assert (await client.get("/api/v1/mixer/speed")).status == 200
-        async with client.post(SETPOINT, json={"value": 50}) as answer:
-            message = "mixer/setpoint is set by operators: your role is viewer"
-            assert (answer.status, await reason(answer)) == (403, message)
-
-    play(script, replace(CLOSED, anonymous=Role.VIEWER))
-
-
-@pytest.mark.parametrize(
-    ("name", "variable", "status"),
-    [
-        ("vera", "setpoint", 403),
-        ("otto", "setpoint", 200),
-        ("otto", "speed", 403),
-        ("elsa", "setpoint", 200),
-        ("elsa", "speed", 200),
-    ],
-)
-def test_role_decides_about_a_write(name, variable, status):
-    async def script(found: Site) -> None:
-        browser, headers = await found.log_in(name)
-        path = f"/api/v1/mixer/{variable}"
-        async with browser.post(path, json={"value": 50}, headers=headers) as answer:
-            assert answer.status == status
-        written = [each["origin"].user for each in found.plant.written]
-        assert written == ([name] if status == 200 else [])
-
-    play(script, CLOSED)
-
-
-def test_change_by_a_browser_needs_the_token_of_its_session():
-    async def script(found: Site) -> None:
-        browser, headers = await found.log_in("otto")
-        _, others = await found.log_in("elsa")
-        for token in ("", "x", "ü", others["X-CSRF-Token"]):
-            wrong = headers | {"X-CSRF-Token": token}
-            async with browser.post(SETPOINT, json={"value": 50}, headers=wrong) as answer:
-                assert (answer.status, "X-CSRF-Token" in await reason(answer)) == (403, True)
-        # Without Origin, too: the cookie alone is no proof.
-        async with browser.post(SETPOINT, json={"value": 50}) as answer:
-            assert answer.status == 403
-        assert not found.plant.written
-
-    play(script, CLOSED)
-
-
-@pytest.mark.parametrize(
-    "header", [{"Origin": "http://evil.example"}, {"Origin": "null"},
-               {"Sec-Fetch-Site": "cross-site"}, {"Sec-Fetch-Site": "same-site"}],
-)  # fmt: skip
-def test_page_of_another_site_changes_nothing_and_opens_no_websocket(header):
-    async def script(found: Site) -> None:
-        client = await found.client()
-        token = (await (await client.get("/api/v1/session")).json())["csrf"]
-        headers = header | {"X-CSRF-Token": token}
-        async with client.post(SETPOINT, json={"value": 50}, headers=headers) as answer:
-            assert answer.status == 403
-        with pytest.raises(WSServerHandshakeError) as caught:
-            await client.ws_connect("/api/v1/ws", headers=header)
-        assert caught.value.status == 403
-        assert not found.plant.written
-        # Nothing allows another origin to read an answer.
-        async with client.get("/api/v1/session", headers=header) as answer:
-            assert not [name for name in answer.headers if name.startswith("Access-Control")]
-
-    play(script)
-
-
-@pytest.mark.parametrize(
-    ("host", "is_known"),
-    [
-        ("127.0.0.1:8080", True),
-        ("localhost", True),
-        ("[::1]:80", True),
-        ("10.1.2.3", True),
-        ("panel.works.example:8080", True),
-        ("PANEL.works.example.", True),
-        ("evil.example", False),
-        ("127.0.0.1.evil.example", False),
-        ("panel.works.example.evil.example", False),
-        ("", False),
-        ("a b", False),
-    ],
-)
-def test_host_header_is_an_address_or_a_known_name(host, is_known):
-    async def script(found: Site) -> None:
-        client = await found.client()
-        async with client.get("/api/v1/session", headers={"Host": host}) as answer:
-            assert (answer.status == 200) is is_known
-
-    play(script, replace(OPEN, hosts=("panel.works.example",)))
-
-
-def test_session_cookie_is_out_of_reach_of_scripts_and_other_sites():
-    async def cookie(section: WebSection) -> str:
-        async with site(section) as found:
-            client = await found.client()
-            body = {"user": "otto", "password": PASSWORD}
-            async with client.post("/api/v1/login", json=body) as answer:
-                return answer.headers["Set-Cookie"]
-
-    plain = asyncio.run(cookie(CLOSED))
-    assert "HttpOnly" in plain
-    assert "SameSite=Strict" in plain
-    assert "Secure" not in plain
-    # The flag follows the key; the test server itself speaks no TLS.
-    tls = WebTls(certificate="page.crt", key="page.key")
-    assert "Secure" in asyncio.run(cookie(replace(CLOSED, tls=tls)))
-
-
-def test_logout_ends_session_and_websockets():
-    async def script(found: Site) -> None:
-        browser, headers = await found.log_in("otto")
-        token = next(iter(browser.session.cookie_jar)).value
-        socket = await browser.ws_connect("/api/v1/ws")
-        assert (await socket.receive_json())["user"] == "otto"
-        async with browser.post("/api/v1/logout", json={}, headers=headers) as answer:
-            assert answer.status == 200
-        assert (await socket.receive()).type in {WSMsgType.CLOSE, WSMsgType.CLOSING}
-        assert (await browser.get("/api/v1/status")).status == 401
-        stolen = {"Cookie": f"{guard.COOKIE}={token}"}
-        assert (await (await found.client()).get("/api/v1/status", headers=stolen)).status == 401
-
-    play(script, CLOSED)
-
-
-def test_wrong_passwords_lock_user_out_of_that_host():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        for _ in range(FREE_FAILURES):
-            body = {"user": "otto", "password": "wrong"}
-            async with client.post("/api/v1/login", json=body) as answer:
-                assert answer.status == 401
-        body["password"] = PASSWORD
-        async with client.post("/api/v1/login", json=body) as answer:
-            assert answer.status == 429
-            assert 1 <= int(answer.headers["Retry-After"]) <= 30
-        async with client.get("/api/v1/status", headers=basic("otto", PASSWORD)) as answer:
-            assert answer.status == 429
-        body["user"] = "elsa"
-        async with client.post("/api/v1/login", json=body) as answer:
-            assert answer.status == 200
-
-    play(script, CLOSED)
-
-
-@pytest.mark.parametrize(
-    ("name", "password"), [("nobody", PASSWORD), ("otto", ""), ("otto", "x" * 1000), ("", "")]
-)
-def test_wrong_login_is_refused(name, password):
-    async def script(found: Site) -> None:
-        client = await found.client()
-        body = {"user": name, "password": password}
-        async with client.post("/api/v1/login", json=body) as answer:
-            assert (answer.status, await reason(answer)) == (401, "unknown user or wrong password")
-        async with client.post("/api/v1/login", json={"user": 1}) as answer:
-            assert answer.status == 400
-
-    play(script, CLOSED)
-
-
-def test_program_authenticates_each_request_by_password():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        right, wrong = basic("otto", PASSWORD), basic("otto", "x")
-        async with client.post(SETPOINT, json={"value": 60}, headers=right) as answer:
-            assert answer.status == 200
-        async with client.post(SETPOINT, json={"value": 61}, headers=wrong) as answer:
-            assert answer.status == 401
-        for given in ("Basic !!!", "Basic", "Bearer b3R0bzp4", "Basic /w=="):
-            headers = {"Authorization": given}
-            assert (await client.get("/api/v1/status", headers=headers)).status == 401
-        assert [each["origin"].user for each in found.plant.written] == ["otto"]
-
-    play(script, CLOSED)
-
-
-def test_proxy_names_the_user_if_it_is_the_proxy():
-    section = replace(CLOSED, proxy=WebProxy(header="X-Remote-User"))
-    headers = {"X-Remote-User": "otto", "X-Forwarded-For": "1.1.1.1, 10.0.0.9"}
-
-    async def script(found: Site) -> None:
-        client = await found.client()
-        async with client.post(SETPOINT, json={"value": 60}, headers=headers) as answer:
-            assert answer.status == 200
-        (written,) = found.plant.written
-        assert (written["origin"].user, written["origin"].host) == ("otto", "10.0.0.9")
-        headers["X-Remote-User"] = "nobody"
-        assert (await client.get("/api/v1/status", headers=headers)).status == 403
-
-    play(script, section)
-    headers["X-Remote-User"] = "otto"
-
-    async def from_elsewhere(found: Site) -> None:
-        client = await found.client()
-        assert (await client.get("/api/v1/status", headers=headers)).status == 403
-
-    elsewhere = WebProxy(header="X-Remote-User", networks=("10.0.0.0/8",))
-    play(from_elsewhere, replace(section, proxy=elsewhere))
-
-
-def test_rate_of_a_host_is_limited(monkeypatch):
-    monkeypatch.setattr(guard, "_RATE", (5, 0.001))
-
-    async def script(found: Site) -> None:
-        client = await found.client()
-        statuses = [(await client.get("/api/v1/session")).status for _ in range(8)]
-        assert statuses == [200] * 5 + [429] * 3
-
-    play(script)
-
-
-def test_browser_that_opens_many_tabs_gets_all_files():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        statuses = {(await client.get("/app.js")).status for _ in range(300)}
-        assert statuses == {200}
-
-    play(script)
-
-
-def test_hosts_behind_a_proxy_have_rates_of_their_own(monkeypatch):
-    monkeypatch.setattr(guard, "_RATE", (2, 0.001))
-
-    async def script(found: Site) -> None:
-        client = await found.client()
-        statuses = [
-            (await client.get("/api/v1/session", headers={"X-Forwarded-For": host})).status
-            for host in ("10.0.0.1", "10.0.0.2", "10.0.0.1", "10.0.0.2", "10.0.0.1, 10.0.0.2")
-        ]
-        assert statuses == [200] * 4 + [429]
-
-    play(script, replace(CLOSED, proxy=WebProxy(header="X-Remote-User")))
-    with pytest.raises(AssertionError):  # without a proxy the header says nothing
-        play(script, CLOSED)
 
 
 def test_picture_of_a_page_has_nothing_that_runs(tmp_path):
@@ -604,172 +274,6 @@ def test_default_pages_are_one_of_the_plant_and_one_a_station():
         assert [each["name"] for each in pages] == ["line", "mixer"]
         kinds = [panel["kind"] for panel in pages[1]["panels"]]
         assert kinds == ["plant", "variables", "bus", "routes", "events"]
-
-    play(script, WebSection())
-
-
-async def subscribed(client, *topics: str):
-    socket = await client.ws_connect("/api/v1/ws")
-    welcome = await socket.receive_json()
-    assert (welcome["type"], welcome["version"], welcome["plant"]) == ("welcome", 1, "line")
-    await socket.send_json({"subscribe": topics})
-    return socket
-
-
-async def of_type(socket, kind: str) -> dict:
-    while (message := await socket.receive_json())["type"] != kind:
-        pass
-    return message
-
-
-def test_websocket_sends_values_of_a_page_as_they_change():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        socket = await subscribed(client, "page:Line", "plant", "events")
-        assert (await of_type(socket, "subscribed"))["errors"] == {}
-        assert (await of_type(socket, "plant"))["stations"][0]["name"] == "mixer"
-        found.plant.values["speed"] = 51.5
-        while True:
-            values = (await of_type(socket, "values"))["values"]
-            if values["mixer/speed"][0] == 51.5:
-                break
-        value, age_us, is_stale = values["mixer/far"]
-        assert (value, is_stale) == (7, False)
-        assert age_us >= 300
-        # Each subscribe replaces the topics before.
-        await socket.send_json({"subscribe": []})
-        assert (await of_type(socket, "subscribed"))["topics"] == []
-
-    play(script)
-
-
-def test_websocket_names_wrong_topics():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        topics = [
-            "page:Lime",
-            "values:speed",
-            "x",
-            "y" * 1000,
-            *(f"values:a/{n}" for n in range(9)),
-        ]
-        socket = await subscribed(client, *topics)
-        errors = (await of_type(socket, "subscribed"))["errors"]
-        assert errors["page:Lime"] == "unknown page 'Lime', did you mean Line?"
-        assert errors["values:a/8"] == "a connection has 8 topics at most"
-        assert len(errors) == 5
-
-    play(script)
-
-
-@pytest.mark.parametrize("text", ["x", "[]", '{"subscribe": "x"}', '{"subscribe": [], "x": 1}'])
-def test_websocket_with_a_wrong_message_is_closed(text):
-    async def script(found: Site) -> None:
-        client = await found.client()
-        socket = await client.ws_connect("/api/v1/ws")
-        await socket.send_str(text)
-        while (await socket.receive()).type is WSMsgType.TEXT:
-            pass
-        assert socket.close_code == 1007
-
-    play(script)
-
-
-def test_websocket_with_a_long_message_or_too_many_is_closed():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        for texts in (["x" * 5000], ['{"subscribe": []}'] * 50):
-            socket = await client.ws_connect("/api/v1/ws")
-            for text in texts:
-                await socket.send_str(text)
-            while (await socket.receive()).type is WSMsgType.TEXT:
-                pass
-            assert socket.close_code in {1008, 1009}
-
-    play(script)
-
-
-def test_number_of_websockets_is_bounded(monkeypatch):
-    monkeypatch.setattr(sockets, "MAX_PER_HOST", 2)
-
-    async def script(found: Site) -> None:
-        client = await found.client()
-        first = await client.ws_connect("/api/v1/ws")
-        await client.ws_connect("/api/v1/ws")
-        with pytest.raises(WSServerHandshakeError) as caught:
-            await client.ws_connect("/api/v1/ws")
-        assert caught.value.status == 503
-        await first.close()
-        while True:
-            try:
-                await client.ws_connect("/api/v1/ws")
-            except WSServerHandshakeError:
-                await asyncio.sleep(0.01)
-            else:
-                break
-
-    play(script)
-
-
-def test_client_that_does_not_read_stalls_nobody_and_is_disconnected(monkeypatch):
-    monkeypatch.setattr(sockets, "SLOW_S", 1.0)
-    plant = StubPlant()
-    # More than the buffers of a connection hold within a second.
-    plant.values["far"] = "x" * 2_000_000
-
-    async def script(found: Site) -> None:
-        reader = await found.client()
-        host, port = reader.host, reader.port
-        _, writer = await asyncio.open_connection(host, port, limit=1024)
-        head = f"GET /api/v1/ws HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\n"
-        head += "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-        head += "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-        text = b'{"subscribe": ["values:mixer/far"]}'
-        writer.write(head.encode() + bytes((0x81, 0x80 | len(text), 0, 0, 0, 0)) + text)
-        socket = await subscribed(reader, "values:mixer/speed")
-        began_s, seen = monotonic(), 0
-        while len(found.server.sockets._open) < 2:
-            await of_type(socket, "values")
-        while len(found.server.sockets._open) > 1:
-            await of_type(socket, "values")
-            seen += 1
-        assert seen > 3
-        assert monotonic() - began_s < 30
-        writer.transport.abort()
-
-    play(script, WebSection(), plant)
-
-
-def test_values_grow_stale_while_the_plant_does_not_answer_and_come_back():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        socket = await subscribed(client, "values:mixer/speed")
-
-        async def until(stale: bool) -> None:
-            while (await of_type(socket, "values"))["values"]["mixer/speed"][2] is not stale:
-                pass
-
-        await until(stale=False)
-        found.plant.answers = False
-        await until(stale=True)
-        async with client.get("/api/v1/mixer/speed") as answer:
-            assert answer.status == 503
-        found.plant.answers = True
-        await until(stale=False)
-
-    play(script)
-
-
-def test_plant_that_ends_keeps_its_name_and_pages():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        socket = await subscribed(client, "plant")
-        found.plant.answers = False
-        while not (await of_type(socket, "plant"))["unreachable"]:
-            pass
-        pages = (await (await client.get("/api/v1/pages")).json())["pages"]
-        assert [each["name"] for each in pages] == ["line", "mixer"]
-        assert (await (await client.get("/api/v1/session")).json())["plant"] == "line"
 
     play(script, WebSection())
 
@@ -816,18 +320,6 @@ def test_history_keeps_the_values_of_trends_without_a_browser():
             assert answer.status == 400
 
     play(script)
-
-
-def test_tables_are_sent_once_a_second():
-    async def script(found: Site) -> None:
-        client = await found.client()
-        socket = await subscribed(client, "page:All")
-        while (await of_type(socket, "values"))["values"]["mixer/speed"][0] != 50.5:
-            pass
-        topic = found.server.topics._topics["page:All"]
-        assert (topic.names[100], len(topic.names[1000])) == ([], 3)
-
-    play(script, WebSection(pages=(page(TablePanel(), name="All"),)))
 
 
 @asynccontextmanager
