@@ -68,7 +68,7 @@ test-package: deb  ## test wheel, Debian package and image (as root: in a clean 
 fuzz: setup  ## damage messages to each decoder and listening socket for SECONDS (10) each; finds are kept in .fuzz
 	@sh tools/isolated.sh $(BIN)/python -m tools.fuzz $(if $(SECONDS),--seconds '$(SECONDS)') $(ARGS)
 
-properties: setup  ## run the property tests with all their examples; make test takes a quarter
+properties: setup  ## run the property tests with all their examples; make test takes a tenth
 	@$(PYTEST) -m hypothesis --hypothesis-profile=full tests $(ARGS)
 
 check: setup  ## format, lint, types, import contracts, tree, and whether each test can be imported

@@ -26,7 +26,6 @@ import pytest
 
 from eap.codec.ads import IndexGroup
 from eap.codec.ams import CONTROL_PORT
-from eap.config.passwords import PasswordHash
 from eap.config.pd_keys import read_keys
 from eap.pd.authentication import SIGNATURE_ID, SIGNATURE_SIZE, KeyRing
 from eap.pd.link import OutFrame
@@ -35,6 +34,7 @@ from tests.support.amsclient import AmsClient
 from tests.support.appliance import Appliance, Plants, plants, run_eapctl, wait_until
 from tests.support.cyclic import octets
 from tests.support.namespaces import Namespace, cable, enter
+from tests.support.passwords import SECRET_HASH
 from tests.support.vectors import load
 
 pytestmark = [pytest.mark.net, pytest.mark.root]
@@ -187,11 +187,10 @@ def _start(farm: Plants, here: Namespace, there: Namespace) -> Site:
     folder = farm.folder
     folder.chmod(0o711)  # users of this host reach the control socket
     (text,) = re.findall(r"```yaml\n(plant: hardened\n.*?)```", PAGE, re.DOTALL)
-    secret = str(PasswordHash.of("secret", bytes(16)))
     accounts = {"anna": pwd.getpwuid(1).pw_name, "otto": pwd.getpwuid(65534).pw_name}
     for name, account in accounts.items():
         text = text.replace(f"unix: [{name}]", f"unix: [{account}]")
-    text = text.replace("scrypt$…", secret).replace("10.0.0.", f"{NET}.")
+    text = text.replace("scrypt$…", SECRET_HASH).replace("10.0.0.", f"{NET}.")
     plant = farm.write(text, "hardened.yaml")
     shutil.copy(ROOT / "config/buses/drive.yaml", folder)
     subprocess.run(
@@ -670,6 +669,7 @@ def test_other_users_of_the_host_do_what_their_role_allows(site: Site) -> None:
 
 CROWD = """
 import socket, sys
+from tests.support.passwords import SECRET_HASH
 held = []
 for _ in range(100):
     held.append(socket.socket(socket.AF_UNIX))

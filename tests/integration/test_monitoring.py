@@ -21,7 +21,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from tests.support.appliance import Appliance, plants
 from tests.support.eventually import wait_until
-from tests.support.webplant import HASH, PASSWORD
+from tests.support.passwords import HASH, PASSWORD
 
 pytestmark = pytest.mark.net
 

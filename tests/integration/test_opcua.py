@@ -18,9 +18,9 @@ from typing import Any
 
 import pytest
 
-from eap.config.passwords import PasswordHash
 from tests.support.appliance import Appliance, Plants, plants, run_eapctl, wait_until
 from tests.support.npm import NODE_MODULES, needs_npm, node_environment
+from tests.support.passwords import SECRET_HASH
 
 pytestmark = [
     pytest.mark.net,
@@ -30,8 +30,8 @@ pytestmark = [
 PAGE = (Path(__file__).parents[2] / "docs/opcua.md").read_text()
 CONTROL = (Path(__file__).parents[2] / "docs/control.md").read_text()
 URL, CLOSED_URL = "opc.tcp://127.0.0.1:4840", "opc.tcp://127.0.0.1:4841"
-HASH = str(PasswordHash.of("secret", bytes(16)))
-PLANT = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[0].replace("scrypt$32768$8$1$…$…", HASH)
+PLANT = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[0]
+PLANT = PLANT.replace("scrypt$32768$8$1$…$…", SECRET_HASH)
 # Changed for tests alone: what a client may not do, and values that are not received.
 SOURCES = re.findall(r"    sources: .*\n", PLANT)[0]
 PRESS = PLANT.replace(
@@ -75,7 +75,7 @@ def folder() -> Iterator[Plants]:
 @pytest.fixture(scope="module")
 def press(folder: Plants) -> Appliance:
     found = folder.start(folder.write(PRESS))
-    closed = folder.start(folder.write(CLOSED.replace("HASH", HASH), "closed.yaml"))
+    closed = folder.start(folder.write(CLOSED.replace("HASH", SECRET_HASH), "closed.yaml"))
     for each in (found, closed):
         each.wait_ready()
         wait_until(lambda each=each: bridge_of(each).get("is_up"), 90)

@@ -18,7 +18,7 @@ import pytest
 
 from tests.support.appliance import EAPCTL, Appliance, Plants, plants
 from tests.support.eventually import wait_until
-from tests.support.webplant import HASH, PASSWORD
+from tests.support.passwords import HASH, PASSWORD
 
 pytestmark = pytest.mark.net
 

@@ -16,7 +16,7 @@ import pytest
 
 from tests.support.appliance import EAPCTL, Appliance, Plants, SharedAppliance, plants, wait_until
 from tests.support.browser import Tab, Tabs, browser
-from tests.support.webplant import HASH, PASSWORD
+from tests.support.passwords import HASH, PASSWORD
 
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Route

@@ -14,10 +14,10 @@ from typing import Any
 import aiohttp
 import pytest
 
-from eap.config.passwords import PasswordHash
 from eap.config.web_sections import Panel
 from eap.runtime.plantfile import load_plant
 from tests.support.appliance import Appliance, Plants, plants, wait_until
+from tests.support.passwords import SECRET_HASH
 
 pytestmark = pytest.mark.net
 
@@ -26,7 +26,6 @@ API = (REPOSITORY / "docs/web-api.md").read_text()
 PAGE = (REPOSITORY / "docs/web.md").read_text()
 REFERENCE = (REPOSITORY / "docs/plant-file.md").read_text()
 REQUESTS = re.findall(r"```sh\ncurl (.*?)\n```\n\n```json\n(.*?)\n```", API, re.DOTALL)
-HASH = str(PasswordHash.of("secret", bytes(16)))
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +121,7 @@ def test_plants_of_the_page_are_right(tmp_path):
     for example in examples:
         plant = tmp_path / "plant.yaml"
         text = example if example.startswith("plant:") else whole.partition("web:")[0] + example
-        plant.write_text(re.sub(r'"scrypt[^"]*"', f'"{HASH}"', text))
+        plant.write_text(re.sub(r'"scrypt[^"]*"', f'"{SECRET_HASH}"', text))
         assert [str(each) for each in load_plant(plant).findings] == [], example
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-import pandas as pd
 import pytest
 
 from eap.codec.pd import PdFrameHeader, PdHeader, encode_frame
@@ -83,6 +82,8 @@ def test_pandas_reads_csv_and_parquet_alike(tmp_path: Path) -> None:
     values = write_values(tmp_path / "a.mcap")
     for form in ("csv", "parquet"):
         export_recording(ExportRequest(file=values, form=form), print)
+    import pandas as pd
+
     from_csv = pd.read_csv(tmp_path / "a.csv")
     from_parquet = pd.read_parquet(tmp_path / "a.parquet")
     assert list(from_csv.columns) == list(from_parquet.columns)

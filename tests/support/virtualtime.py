@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
+from types import ModuleType
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -71,19 +72,35 @@ def run_virtual(scene: Coroutine[Any, Any, T]) -> T:
         return runner.run(scene)
 
 
+_CLOCKS = time.monotonic, time.monotonic_ns
+_seen: set[str] = set()
+_users: list[tuple[str, str]] = []
+"""Modules of ours that import a clock, with its name, among the thousands that were *seen*."""
+
+
+def _real_clocks() -> list[tuple[ModuleType, Callable[[], float]]]:
+    """Return each module of ours that has a clock as its own, with this clock."""
+    for name in sys.modules.keys() - _seen:
+        _seen.add(name)
+        if name.startswith(("eap.", "tests.")) and name != __name__:
+            own = vars(sys.modules[name])
+            _users.extend((name, each.__name__) for each in _CLOCKS if each.__name__ in own)
+    found = [(sys.modules.get(name), clock) for name, clock in _users]
+    return [
+        (module, real)
+        for module, clock in found
+        for real in _CLOCKS
+        if module is not None and vars(module).get(clock) is real
+    ]
+
+
 @contextmanager
 def _clock_of(loop: asyncio.AbstractEventLoop) -> Iterator[None]:
     clocks: dict[Callable[[], float], Callable[[], float]] = {
         time.monotonic: loop.time,
         time.monotonic_ns: lambda: round(loop.time() * 1e9),
     }
-    found = [
-        (module, real)
-        for name, module in list(sys.modules.items())
-        if name.startswith(("eap.", "tests.")) and name != __name__
-        for real in clocks
-        if vars(module).get(real.__name__) is real
-    ]
+    found = _real_clocks()
     for module, real in found:
         setattr(module, real.__name__, clocks[real])
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import copy
-import hashlib
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from typing import Any
@@ -14,7 +13,6 @@ from aiohttp.test_utils import TestClient, TestServer
 from msgspec.structs import replace
 
 from eap.ams.spec import Role
-from eap.config.passwords import PasswordHash
 from eap.config.users import AccountSection
 from eap.config.web_sections import SetPanel, TrendPanel, ValuePanel, WebPage, WebSection
 from eap.control.protocol import ErrorCode, ValuesEvent
@@ -23,13 +21,9 @@ from eap.live.client import LiveClient
 from eap.live.transport import ValuesSubscription
 from eap.live.view import LiveView
 from eap.web.server import PageServer
+from tests.support.passwords import HASH, PASSWORD
 from tests.support.statusdocument import document, rx
 
-PASSWORD = "correct horse"
-SALT = bytes(range(16))
-# The weakest that is taken: half the time of those that PasswordHash.of() makes.
-_SCRYPT_KEY = hashlib.scrypt(PASSWORD.encode(), salt=SALT, n=1 << 14, r=8, p=1, dklen=32)
-HASH = str(PasswordHash(1 << 14, 8, 1, SALT, _SCRYPT_KEY))
 KEY = bytes(32)
 VARIABLES = [
     {"name": "speed", "type": "REAL", "writer": "engine", "unit": "1/min", "comment": ""},

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from eap.cli.group import main
-from tests.support.webplant import HASH
+from tests.support.passwords import HASH
 
 PLANT = """\
 plant: line

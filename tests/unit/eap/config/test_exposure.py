@@ -5,11 +5,10 @@ from __future__ import annotations
 import pytest
 
 from eap.config.load import load
-from eap.config.passwords import PasswordHash
 from eap.ops.check import check_file
 from tests.support.pages import ROOT
+from tests.support.passwords import HASH
 
-HASH = PasswordHash.of("secret", bytes(16))
 OPEN = f"""\
 plant: cell
 stations:

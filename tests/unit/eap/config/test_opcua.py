@@ -11,7 +11,7 @@ from eap.config.listen import role_of_anonymous
 from eap.config.load import PlantResult, load
 from eap.config.opcua import channel_securities
 from eap.config.opcua_sections import ChannelSecurity, OpcUaSection
-from tests.support.webplant import HASH
+from tests.support.passwords import HASH
 
 PLANT = """\
 plant: line

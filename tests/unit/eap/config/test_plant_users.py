@@ -8,7 +8,7 @@ from eap.ams.spec import AccessRule, Role
 from eap.config.index import ExpectedBus
 from eap.config.load import Plant, PlantResult, load
 from eap.config.opcua_sections import OpcUaSection
-from tests.support.webplant import HASH
+from tests.support.passwords import HASH
 
 PLANT = """\
 plant: line

@@ -14,7 +14,7 @@ from eap.config.load import PlantResult, load
 from eap.config.web import window_s
 from eap.config.web_sections import WebSection
 from eap.patterns import match_names
-from tests.support.webplant import HASH
+from tests.support.passwords import HASH
 
 PLANT = """\
 plant: line

@@ -12,10 +12,10 @@ from eap.ams.spec import Role
 from eap.config.web_sections import WebProxy, WebSection, WebTls
 from eap.runtime.logins import FREE_FAILURES
 from eap.web import guard
+from tests.support.passwords import PASSWORD
 from tests.support.webplant import (
     CLOSED,
     OPEN,
-    PASSWORD,
     SETPOINT,
     Site,
     basic,

@@ -17,10 +17,10 @@ from eap.errors import EnvironmentalError
 from eap.live.view import LiveView
 from eap.web import guard, server
 from eap.web.process import session_key
+from tests.support.passwords import PASSWORD
 from tests.support.webplant import (
     CLOSED,
     KEY,
-    PASSWORD,
     SETPOINT,
     Site,
     basic,
