@@ -138,8 +138,8 @@ def state_dir() -> Iterator[None]:
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Run two workers a core: most of what tests of running plants do is to wait."""
-    return min(2 * (os.cpu_count() or 1), 8)
+    """Run three workers a core: most of what tests of running plants do is to wait."""
+    return min(3 * (os.cpu_count() or 1), 8)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -213,9 +213,8 @@ gc.disable()  # until all tests are collected: what that makes stays
 
 def pytest_collection_finish() -> None:
     """Let the garbage collector pass over the thousands of tests that are there to the end."""
+    gc.freeze()  # garbage of the collection, too: to find it takes longer than to keep it
     gc.enable()
-    gc.collect()
-    gc.freeze()
     gc.set_threshold(20_000, 20, 20)
 
 

@@ -7,7 +7,6 @@ import re
 import shutil
 import socket
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import pytest
 
 from eap.ops.client import connect
-from tests.support.appliance import wait_until
+from tests.support.appliance import start_eapctl, wait_until
 
 pytestmark = pytest.mark.net
 
@@ -48,9 +47,7 @@ def control(monkeypatch):
     monkeypatch.setenv("EAP_RUNTIME_DIR", str(folder))
     (folder / "kiln.yaml").write_text(PLANT)
     (folder / "oven.yaml").write_text(OVEN)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "eap", "run", str(folder / "kiln.yaml")], stdout=subprocess.PIPE
-    )
+    process = start_eapctl("run", str(folder / "kiln.yaml"), stdout=subprocess.PIPE)
     try:
         assert process.stdout is not None
         assert process.stdout.readline()

@@ -51,10 +51,11 @@ class Appliance:
         self._prefix = prefix
         self._state = {"EAP_STATE_DIR": str(state)} if state else {}
         words = [str(plant), *arguments] if plant else arguments
-        is_forked = not is_real and preloaded.is_possible(prefix)
-        start = preloaded.start if is_forked else subprocess.Popen
-        self.process: subprocess.Popen[str] = start(
-            [*prefix, *EAPCTL, "run", *words],
+        self.process: subprocess.Popen[str] = start_eapctl(
+            "run",
+            *words,
+            prefix=prefix,
+            is_real=is_real,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env=self._environment(),
@@ -175,6 +176,18 @@ def run_eapctl(runtime: Path, *words: str) -> subprocess.CompletedProcess[str]:
     with mock.patch.dict(os.environ, {VARIABLE: str(runtime)}):
         result = CliRunner().invoke(eapctl, words, prog_name="eapctl", catch_exceptions=False)
     return subprocess.CompletedProcess(words, result.exit_code, result.stdout, result.stderr)
+
+
+def start_eapctl(
+    *words: str, prefix: Sequence[str] = (), is_real: bool = False, **options: Any
+) -> subprocess.Popen[Any]:
+    """Start a command as :class:`subprocess.Popen` does, maybe in a namespace.
+
+    It is forked unless it *is_real*, see :mod:`tests.support.preloaded`.
+    """
+    is_forked = not is_real and preloaded.is_possible(prefix)
+    start = preloaded.start if is_forked else subprocess.Popen
+    return start([*prefix, *EAPCTL, *words], **options)
 
 
 def spawn_eapctl(runtime: Path, *words: str) -> subprocess.CompletedProcess[str]:

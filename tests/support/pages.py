@@ -16,6 +16,7 @@ from unittest import mock
 from click.testing import CliRunner
 
 from eap.cli.group import main as eapctl
+from tests.support.appliance import start_eapctl
 
 ROOT = Path(__file__).parents[2]
 _EAPCTL = re.compile(r"eapctl( [^|&;<>$*'\"\\]+)+")
@@ -104,13 +105,11 @@ class Shell:
             process.communicate(timeout=20)
 
     def _start(self, words: list[str]) -> str:
-        process = subprocess.Popen(
-            words,
-            cwd=self.folder,
-            env=os.environ | self._environment,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        options = {"cwd": self.folder, "env": os.environ | self._environment, "text": True}
+        if words[0] == "eapctl":
+            process = start_eapctl(*words[1:], stdout=subprocess.PIPE, **options)
+        else:
+            process = subprocess.Popen(words, stdout=subprocess.PIPE, **options)
         self._running.append(process)
         assert process.stdout is not None
         return process.stdout.readline()

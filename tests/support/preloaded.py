@@ -1,20 +1,20 @@
 """Appliances forked from a Python that has imported them: a quarter of the time of a start.
 
-Most of a start is the import of some hundred modules, in each process anew.  Here a *nursery* has
-done that once for all tests of a worker::
+Most of a start is the import of some hundred modules, in each process anew.  Here a *fork server*
+has done that once for all tests of a worker::
 
-    worker ── nursery          it forks supervisors, as children of the worker
+    worker ── fork server          it forks supervisors, as children of the worker
        └───── supervisor
-                 ├── nursery   of its own, forked before anything else; it forks the processes of
-                 └── engine    the appliance, as children of the supervisor
+                 ├── fork server   of its own, forked before anything else; it forks the processes
+                 └── engine        of the appliance, as children of the supervisor
 
 Signals, ends, descriptors, groups, limits, umask, network and environment are as of processes that
-start by themselves; command lines are those of the nursery, and memory has what any of the
-processes imports.  Programs start instead with *is_real*, with a prefix that does more than to
-enter a namespace, with other settings of Python, in an appliance of which a process has ended, and
-everywhere with EAP_TEST_REAL=1.
+start by themselves.  Two things differ: the command lines are those of the fork server, and memory
+has what any of the processes imports.  Programs start instead with *is_real*, with a prefix that
+does more than to enter a namespace, with other settings of Python, in an appliance of which a
+process has ended, and everywhere with EAP_TEST_REAL=1.
 
-Run as a module, this is the nursery of a worker.
+Run as a module, this is the fork server of a worker.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _ANSWER_S = 240.0
 _MAX_REQUEST = 1 << 20
 _MAX_DESCRIPTORS = 200
 _ABOVE = 600
-"""Descriptors from here on are free while others get their places."""
+"""Descriptors from here on are free while those of a request get their numbers."""
 
 
 def _settings() -> dict[str, str]:
@@ -69,22 +69,22 @@ def _umask() -> int:
 
 
 def is_possible(prefix: Sequence[str]) -> bool:
-    """Tell whether appliances that *prefix* starts may come from a nursery here and now."""
+    """Tell whether appliances that *prefix* starts may come from a fork server here and now."""
     is_plain = not prefix or (tuple(prefix[:3]) == _INSIDE and len(prefix) == 4)
     is_allowed = not os.environ.get("EAP_TEST_REAL") and _settings() == _SETTINGS
     return is_plain and is_allowed and _CLONE is not None
 
 
 class _Forked(subprocess.Popen[Any]):
-    """Process that a nursery forks; all else is as of one that is started.
+    """Process that a fork server forks; all else is as of one that is started.
 
     Args:
-        nursery: Connection to it.
+        server: Connection to it.
         command: Its command line.
     """
 
-    def __init__(self, nursery: socket.socket, command: Sequence[str], **options: Any) -> None:
-        self._nursery = nursery
+    def __init__(self, server: socket.socket, command: Sequence[str], **options: Any) -> None:
+        self._server = server
         super().__init__(command, **options)
 
     def _execute_child(  # type: ignore[misc]
@@ -99,32 +99,32 @@ class _Forked(subprocess.Popen[Any]):
             "folder": str(cwd or Path.cwd()),
             "group": more[-1],
             "limits": [(each, *resource.getrlimit(each)) for each in _LIMITS],
-            "places": [0, 1, 2, *pass_fds],
+            "numbers": [0, 1, 2, *pass_fds],
             "umask": _umask(),
         }
         network = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
         try:
-            self.pid = _ask(self._nursery, request, [network, *standard, *pass_fds])
+            self.pid = _ask(self._server, request, [network, *standard, *pass_fds])
             self._child_created = True
         finally:
             os.close(network)
             self._close_pipe_fds(*pipes)  # type: ignore[attr-defined]
 
 
-def _ask(nursery: socket.socket, request: dict[str, Any], descriptors: Sequence[int]) -> int:
-    """Return the id of the process that *nursery* forks."""
+def _ask(server: socket.socket, request: dict[str, Any], descriptors: Sequence[int]) -> int:
+    """Return the id of the process that *server* forks."""
     data = json.dumps(request).encode()
-    socket.send_fds(nursery, [len(data).to_bytes(4, "little")], descriptors)
-    nursery.sendall(data)
-    answer = nursery.recv(4)
+    socket.send_fds(server, [len(data).to_bytes(4, "little")], descriptors)
+    server.sendall(data)
+    answer = server.recv(4)
     if len(answer) < 4:
-        raise OSError("the nursery of the tests has ended")
+        raise OSError("the fork server of the tests has ended")
     return int.from_bytes(answer, "little")
 
 
 @cache
-def _nursery() -> socket.socket:
-    """Start the nursery of this worker."""
+def _fork_server() -> socket.socket:
+    """Start the fork server of this worker, and return the connection to it."""
     own, its = socket.socketpair()
     own.settimeout(_ANSWER_S)
     with its:
@@ -139,7 +139,7 @@ def _nursery() -> socket.socket:
 
 def start(command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
     """Start ``python -m eap``, maybe in a namespace, as :class:`subprocess.Popen` does."""
-    return _Forked(_nursery(), command, **options)
+    return _Forked(_fork_server(), command, **options)
 
 
 def _clone_for_parent() -> int:
@@ -169,16 +169,16 @@ def _serve(connection: socket.socket, run: Callable[[list[str]], int | None]) ->
         pid = _clone_for_parent()
         if not pid:
             connection.close()
-            _become(json.loads(data), descriptors, run)
+            _run_request(json.loads(data), descriptors, run)
         for each in descriptors:
             os.close(each)
         connection.sendall(pid.to_bytes(4, "little"))
 
 
-def _become(
+def _run_request(
     request: dict[str, Any], descriptors: list[int], run: Callable[[list[str]], int | None]
 ) -> None:
-    """Be the process of *request*, to its end."""
+    """Make this process the one of *request*, run it, and end it."""
     code: Any = 1
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -193,9 +193,8 @@ def _become(
             os.setpgid(0, request["group"])
         moved = [fcntl.fcntl(each, fcntl.F_DUPFD_CLOEXEC, _ABOVE) for each in descriptors]
         os.closerange(3, _ABOVE)
-        for place, each in zip(request["places"], moved, strict=True):
-            os.dup2(each, place, inheritable=place < 3)
-            os.set_inheritable(place, True)
+        for number, each in zip(request["numbers"], moved, strict=True):
+            os.dup2(each, number)
         for each in moved:
             os.close(each)
         os.environ.clear()
@@ -218,7 +217,7 @@ def _become(
 
 
 def _run_eapctl(command: list[str]) -> int | None:
-    """Run ``python -m eap WORDS``, whose processes come from a nursery of its own."""
+    """Run ``python -m eap WORDS``, whose processes come from a fork server of its own."""
     import eap.supervisor.child as module
     from eap.__main__ import main
 
@@ -229,8 +228,8 @@ def _run_eapctl(command: list[str]) -> int | None:
     if os.fork() == 0:
         own.close()
         os.setpgid(0, 0)
-        for place in range(3):
-            os.dup2(os.open(os.devnull, os.O_RDWR), place)
+        for number in range(3):
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
         os.dup2(its.detach(), 3)
         os.closerange(4, _ABOVE)
         its = socket.socket(fileno=3)
@@ -239,7 +238,7 @@ def _run_eapctl(command: list[str]) -> int | None:
     made: list[subprocess.Popen[Any]] = []
 
     def start_child(words: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
-        # Whoever kills a process sees that it is away: the next one starts as a program.
+        # A test that kills a process looks at the start of the next one, so this is a program.
         if any(each.returncode is not None for each in made):
             return subprocess.Popen(words, **options)
         made.append(_Forked(own, words, **options))
@@ -260,7 +259,8 @@ def _run_process(command: list[str]) -> int | None:
     return main(command[3:])
 
 
-def _be_nursery(descriptor: int) -> None:
+def _run_fork_server(descriptor: int) -> None:
+    """Import all that appliances import, and fork them as they are requested."""
     gc.disable()
     import eap.cli.plant
     import eap.engine.process
@@ -275,4 +275,4 @@ def _be_nursery(descriptor: int) -> None:
 
 
 if __name__ == "__main__":
-    _be_nursery(int(sys.argv[1]))
+    _run_fork_server(int(sys.argv[1]))

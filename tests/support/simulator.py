@@ -8,12 +8,13 @@ import json
 import os
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
 import pytest
+
+from tests.support.appliance import start_eapctl
 
 _CLONE_NEWNET = 0x40000000
 NEAR, FAR = "near", "far"
@@ -52,9 +53,8 @@ class Simulator:
     """``eapctl sim run`` while it answers."""
 
     def __init__(self, bus: Path, interface: str, *more: str) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "eap", "sim", "run", str(bus), "--interface", interface,
-             "--faults", *more],
+        self._process = start_eapctl(
+            "sim", "run", str(bus), "--interface", interface, "--faults", *more,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
