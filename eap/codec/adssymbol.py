@@ -149,6 +149,7 @@ def encode_entry(entry: SymbolEntry) -> bytes:
     texts = [encode_text(text) for text in (entry.name, entry.type_name, entry.comment)]
     flags = entry.flags
     if entry.guid:
+        # The flags tell clients what stands behind the texts.
         flags |= SymbolFlag.TYPE_GUID
     if entry.attributes:
         flags |= SymbolFlag.ATTRIBUTES

@@ -69,6 +69,7 @@ def iter_fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
 
 def _read_varint(data: bytes, offset: int) -> tuple[int, int]:
     value = 0
+    # 64 bits in groups of seven; more would make a number of any length.
     for position in range(_MAX_VARINT):
         if offset + position >= len(data):
             raise TruncatedError("the data ends within it", layout="protobuf number", offset=offset)

@@ -232,6 +232,7 @@ def decode_payload(data: bytes) -> SparkplugPayload:
 
 
 def _decode_metric(data: bytes, room: list[int], depth: int) -> Metric:
+    # A list, so that the metrics in templates count, too.
     room[0] -= 1
     if room[0] < 0 or not depth:
         raise MalformedError(f"more than {MAX_METRICS} metrics, or nested too deep", layout=_LAYOUT)
@@ -248,6 +249,7 @@ def _decode_metric(data: bytes, room: list[int], depth: int) -> Metric:
             kind = _kind(content)
         elif _METRIC_VALUE <= number <= _METRIC_VALUE + _TEMPLATE:
             raw = number - _METRIC_VALUE, content
+    # At the end: the type may stand behind the value.
     if raw is not None:
         value = _decode_value(raw[0], raw[1], kind, room, depth)
     return Metric(name, kind, value, alias, time_ms)

@@ -309,6 +309,8 @@ class DateAndTime(Timed, frozen=True):
     expected = "a date and time without a zone such as DT#2026-11-23-12:30:15"
 
     def _to_ns(self, value: Any) -> int | None:
+        # A time with a zone would have to be converted to that of the controller, which nobody
+        # knows.
         is_local = isinstance(value, datetime) and value.tzinfo is None
         return _datetime_ns(value) if is_local else None
 

@@ -167,6 +167,8 @@ def _variables(index: Index, station: StationSection) -> Iterator[VariableSpec]:
         yield VariableSpec(name, text, Writer.SERVICES, unit=unit, comment=comment)
     for name, on_bus in index.bus_variables(station).items():
         is_free = on_bus.is_output and name not in linked
+        # Inputs come from the bus, and a link writes its target: only a free output is left to
+        # programs.
         writer = Writer.APPLICATION if is_free else Writer.ENGINE
         yield VariableSpec(name, on_bus.type, writer, comment=on_bus.comment)
 

@@ -142,6 +142,7 @@ class TypeTable:
         if key in self._twice:
             self._broken.add(key)
             raise self._reported(*self._twice[key], "a file with one type of that name")
+        # A type that has itself as a part would never end.
         if key in self._open or len(self._open) >= MAX_DEPTH:
             raise self._too_deep(key, definition)
         self._open.append(key)

@@ -43,6 +43,7 @@ Protocol = Literal["aoe", "eoe", "coe", "foe", "soe", "voe"]
 """Names of :class:`MailboxType` in lower case; :func:`kind_of` relies on that."""
 State = Literal["INIT", "PREOP", "BOOT", "SAFEOP", "OP"]
 Duration = Annotated[int, Meta(ge=0, le=_MAX_MS)]
+# Rows, not objects: a transfer may have hundreds of datagrams.
 DatagramRow = tuple[int, int, int, str, int]
 """Command, ADP, ADO, bytes, tries (0: as the master's settings say)."""
 ReplyRow = tuple[int, str, int]
@@ -210,6 +211,7 @@ def to_datagram(row: DatagramRow) -> DatagramRequest:
     """Return the datagram of a row; raise ControlError if it has no such command."""
     command, adp, ado, octets, tries = row
     try:
+        # The command is a plain number in the row: that of the wire, for clients in any language.
         return DatagramRequest(Command(command), adp, ado, to_octets(octets), tries)
     except ValueError:
         reason = f"params: {command} is no command of a datagram"
@@ -226,6 +228,7 @@ def to_replies(rows: Sequence[ReplyRow]) -> list[DatagramReply]:
     try:
         return [DatagramReply(bytes.fromhex(octets), wkc, tries) for wkc, octets, tries in rows]
     except ValueError:
+        # Replies come from the appliance: a client has nothing to correct.
         raise BusError("malformed reply on the control socket") from None
 
 

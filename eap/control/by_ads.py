@@ -69,6 +69,7 @@ class PartRequest(WireStruct, frozen=True):
 
 def pack(line: bytes) -> bytes:
     """Return a request of the group CONFIGURE; raise ControlError if it is too long."""
+    # The specification of a large station has more text than AMS/TCP carries at once.
     packed = zlib.compress(line, 6)
     if len(packed) > MAX_PACKED:
         reason = f"a compressed request by ADS has at most {MAX_PACKED} bytes, not {len(packed)}"
@@ -80,9 +81,11 @@ def unpack(data: bytes) -> bytes:
     """Return the line of a request of the group CONFIGURE; raise ControlError if it is none."""
     reader = zlib.decompressobj()
     try:
+        # Limited: a few bytes may decompress to any number.
         line = reader.decompress(data[:MAX_PACKED], MAX_LINE)
     except zlib.error as exc:
         raise ControlError(f"not compressed: {exc}", code=ErrorCode.BAD_REQUEST) from None
+    # Either cut off, or longer than the limit: a part of a specification must not be applied.
     if not reader.eof:
         reason = f"a request has at most {MAX_LINE} bytes, {MAX_PACKED} of them compressed"
         raise ControlError(reason, code=ErrorCode.BAD_REQUEST)

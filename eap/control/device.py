@@ -383,6 +383,7 @@ def plan_answer(plan: Plan) -> PlanAnswer:
 def apply_answer(plan: Plan, fault: DeviceFault | None) -> ApplyAnswer:
     """Return the changes that were made, or why none was."""
     refused = plan.refused if fault is None else [fault.text]
+    # All or nothing: what refuses one entry refuses every one.
     reason = "" if fault is None else fault.text
     results = [
         ChangeResult(**_change_fields(*each), ok=not refused, reason=reason)
@@ -415,10 +416,12 @@ def running_spec(
     spec: StationSpec, previous: Configuration | None, cause: str, undone: bool
 ) -> RunningSpec:
     """Return the specification that runs, the one before the last change, and that change."""
+    # Alternates are of the change itself: nobody has configured them.
     before = None if previous is None else without_alternates(previous.spec)
     return RunningSpec(spec, before, cause, undone)
 
 
 def state_of(word: str) -> int:
     """Return the number of a state; 0 for what is none, which the device refuses."""
+    # The device refuses it, so that the message is the same for every front end.
     return DeviceState.__members__.get(word.upper(), 0)

@@ -292,6 +292,7 @@ def decode_request(line: bytes) -> Request:
     except RecursionError:
         # msgspec raises RecursionError, which is none of its own errors.
         raise ControlError("not a request: nested too deep", code=ErrorCode.BAD_REQUEST) from None
+    # Before the parameters are looked at: another version may give them another meaning.
     if request.v != VERSION:
         raise ControlError(
             f"protocol version {request.v}, this appliance speaks {VERSION}",
@@ -329,6 +330,7 @@ def unless_unavailable() -> Iterator[None]:
 def request_id(line: bytes) -> int | None:
     """Return the id of a line that is otherwise refused, so that its sender can match the error."""
     try:
+        # The line may have any form: its number is looked for without the record.
         number = msgspec.json.decode(line)["id"]
     except (ValueError, RecursionError, KeyError, TypeError):
         return None

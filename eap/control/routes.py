@@ -199,6 +199,7 @@ class RouteRow(EndpointRow, frozen=True, kw_only=True):
     @property
     def pattern(self) -> str:
         """NetIDs that match, such as ``5.1.2.3.*.*``; ``default`` for all."""
+        # Only the bytes that are compared are shown: the others may be any.
         octets = self.net_id.split(".")[: self.octets]
         return ".".join([*octets, *["*"] * (6 - self.octets)]) if self.octets else "default"
 

@@ -47,11 +47,13 @@ def panels_of(series: Iterable[Series]) -> list[ChartPanel]:
     """Return a panel for each unit, and one for truth values, with room around the values."""
     by_unit: dict[tuple[str, bool], list[Series]] = {}
     for each in series:
+        # Values of different units would flatten each other.
         by_unit.setdefault((each.unit, each.is_step), []).append(each)
     found = []
     for (unit, _), members in by_unit.items():
         low = min((value for each in members for value in each.finite()), default=0.0)
         high = max((value for each in members for value in each.finite()), default=1.0)
+        # A constant has room around it, too.
         room = (high - low) * 0.05 or abs(high) * 0.1 or 1.0
         found.append(ChartPanel(unit, members, low - room, high + room))
     return found
@@ -63,6 +65,7 @@ def time_axis(series: Sequence[Series], *, is_relative: bool) -> TimeAxis | None
     if not ends:
         return None
     first, last = min(low for low, _ in ends), max(high for _, high in ends)
+    # A single moment has a length, too: times are divided by it.
     return TimeAxis(first, max(last, first + 1), is_relative)
 
 
@@ -262,6 +265,7 @@ def _dots(line: Sequence[Point], panel: ChartPanel, bottom: int) -> Iterable[tup
             yield x, y
         else:
             count = max(abs(x - last[0]), abs(y - last[1]), 1)
+            # Without gaps, however steep the line is.
             for step in range(1, count + 1):
                 yield (
                     last[0] + (x - last[0]) * step // count,

@@ -48,6 +48,7 @@ class ConditionWatch(Closeable):
             for block in capture.look(offset_ns).blocks
             for _, time_ns, sample in samples_in(block)
         ]
+        # Variables of several stations are compared at one time, in the order of their cycles.
         samples.sort(key=lambda each: each[0])
         values, is_true = self._values, self._condition.is_true
         for time_ns, station, sample in samples:

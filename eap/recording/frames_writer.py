@@ -145,6 +145,7 @@ def section_header(header: RecordingHeader) -> bytes:
         ),
     ]
     for each in header.files:
+        # A file in any encoding comes out with the bytes that it had.
         text = each.content.decode("utf-8", "surrogateescape")
         options += _comments_in_parts(FILE_COMMENT + each.name, text)
     body = struct.pack("<IHHq", BYTE_ORDER, 1, 0, -1) + b"".join(options) + option(END, b"")
@@ -250,6 +251,7 @@ class FramesWriter:
             self.lost += event.count
             if interface is not None:
                 self._lost_at[interface] += event.count
+                # pcapng has the number at the next packet of its interface.
                 self._dropped[interface] = self._dropped.get(interface, 0) + event.count
         self._events.append(_comment(EVENT_COMMENT + msgspec.json.encode(event).decode()))
 
@@ -259,6 +261,7 @@ class FramesWriter:
             octets = memoryview(b"".join(self._blocks))
             self._blocks.clear()
             self._bytes = 0
+            # A disk that is nearly full takes a part.
             while octets:
                 count = os.write(self._file.fileno(), octets)
                 octets = octets[count:]
@@ -277,6 +280,7 @@ class FramesWriter:
         """Add statistics of all interfaces, at Unix time, and close the file."""
         try:
             for interface, lost in enumerate(self._lost_at):
+                # Events behind the last packet have no other place.
                 comments = b"".join(self._events) if not interface else b""
                 body = (
                     struct.pack("<III", interface, time_ns >> 32, time_ns & 0xFFFFFFFF)

@@ -33,6 +33,7 @@ def end_of_file(content: McapFile) -> tuple[int, bytes]:
     builder: Any = RecordBuilder()
     if content.chunks:
         last = content.chunks[-1]
+        # The index of the last chunk may be cut off: it is made anew of the messages.
         if last.offset + last.length + last.index_length == content.whole_until:
             keep = last.offset + last.length
             last.index_offsets.clear()
@@ -43,6 +44,7 @@ def end_of_file(content: McapFile) -> tuple[int, bytes]:
                 last.index_offsets[channel] = keep + builder.count
                 MessageIndex(channel_id=channel, records=records).write(builder)
             last.index_length = builder.count
+    # 0 says that there is no checksum: the file would have to be read as a whole for it.
     DataEnd(data_section_crc=0).write(builder)
     data = builder.end()
     return keep, data + _summary(content, keep + len(data)) + MAGIC

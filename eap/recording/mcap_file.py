@@ -236,6 +236,7 @@ class McapFile:
         while len(head := file.read(RECORD.size)) == RECORD.size:
             code, length = RECORD.unpack(head)
             start = self.whole_until + RECORD.size
+            # A disk that lost power may have zeros where a record was to be.
             if start + length > size or not code:
                 return
             if code == DATA_END:
@@ -259,6 +260,7 @@ class McapFile:
             chunk.index_offsets[channel] = start - RECORD.size
             chunk.counts[channel] = size // 16
             chunk.index_length += RECORD.size + length
+        # Skipped, not read: the length may be damaged.
         elif length > _LARGEST_RECORD:
             return
         elif code == ATTACHMENT:

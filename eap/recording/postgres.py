@@ -56,6 +56,7 @@ class PostgresStore:
             self._prepared = False
         self._plant, self._tables = plant, tables
         for table in tables:
+            # Found before the recording begins, not with the first rows.
             if len(table.columns) > _MOST_COLUMNS:
                 raise StoreError(
                     f"{table.station} has {len(table.columns)} values, a table at most"
@@ -152,6 +153,7 @@ def column_names(table: StoreTable) -> list[str]:
     used = {"time", "time_ns", "cycle"}
     for column in table.columns:
         base = column.name.partition("/")[2]
+        # PostgreSQL cuts longer names itself, and two may become one.
         name, number = base.encode()[:_LONGEST_NAME].decode("utf-8", "ignore"), 1
         while name in used:
             number += 1

@@ -118,6 +118,7 @@ class RecorderProcess:
     def _reason_to_end(self) -> str:
         if self._stops:
             return "stopped"
+        # A supervisor that was killed sends no signal.
         is_orphan = self._parent and os.getppid() != self._parent
         return "the appliance ended" if is_orphan else ""
 
@@ -150,6 +151,7 @@ class RecorderProcess:
     def _accept(self) -> None:
         with suppress(OSError):
             client, _ = self._server.accept()
+            # Each client has a descriptor, which the files need, too.
             if len(self._clients) >= _MAX_CLIENTS:
                 client.close()
                 return
@@ -175,6 +177,7 @@ class RecorderProcess:
             request = msgspec.json.decode(line, type=RecorderRequest)
             if request.do == "stop":
                 self._require_own_end()
+                # Answered when the files are whole: only then may they be copied.
                 self._ending.append(client)
                 self._stops = True
                 return

@@ -89,6 +89,7 @@ class ValuesWriter:
             "release": RELEASE,
             "started_ns": str(header.started_ns),
         }
+        # First of all: a recorder that is killed leaves a file that says what it is.
         writer.add_metadata(HEADER, facts | header.options)
         published = encode_published(header.published)
         self._attach(header.started_ns, PUBLISHED, "application/json", published)

@@ -104,6 +104,7 @@ class _EniReader:
                     self._report.add_error(self._file, exc, item=item)
         except XmlError as exc:
             self._report.add_error(self._file, exc)
+        # A bus without some of its slaves would be a wrong one.
         if len(self._report.findings) > before:
             return None
         if not self._slaves:
@@ -320,6 +321,7 @@ class _SlaveReader:
         # in ESI files (SafeopOpTimeout): the longer of both.
         for transition, key in (("IP", "preop_ms"), ("SO", "safeop_op_ms"), ("PS", "safeop_op_ms")):
             if transition in at and 0 < timeout <= _MAX_TIMEOUT_MS:
+                # Only the command that waits for a state has the time-out of a transition.
                 state = (_octets(command, "Validate/Data") or b"\0")[0]
                 if state in {2, 4, 8}:
                     self._timeouts[key] = max(timeout, self._timeouts.get(key, 0))
@@ -349,6 +351,7 @@ class _SlaveReader:
         if not data:
             raise XmlError(f"{what} has no data", line=command.line, expected="element Data")
         complete = command.attribute_flag("CompleteAccess")
+        # Assignment and mapping are keys of their own: the master writes them in the right order.
         if index in _ASSIGNMENTS or any(index in each for each in _MAPPINGS):
             self._take_list(index, subindex, data, complete)
             return
@@ -609,6 +612,7 @@ def _mailboxes(element: XmlElement, path: str) -> list[XmlElement | None]:
 
 def _unsigned(element: XmlElement, path: str, bits: int = 32) -> int:
     """Return a number of *bits* bits; one with its top bit set may be negative."""
+    # Tools write numbers whose top bit is set as negative ones.
     limit = 1 << bits
     return element.number_at(path, -(limit >> 1), limit - 1) % limit
 
