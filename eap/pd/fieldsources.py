@@ -1,7 +1,7 @@
 """Sources in controllers of other protocols: their values, time-outs and substitutes.
 
-A bridge passes values on as it reads them.  Time-outs are judged here, beside the process image, so
-that a bridge that hangs, dies or was never started is the same to consumers as a controller that
+A bridge passes values on as it reads them.  Time-outs are decided here, beside the process image,
+so that a bridge that hangs, dies or was never started is the same to consumers as a controller that
 does not answer: after the time-out a variable has its substitute, and ``CONTROLLER.ok`` is false.
 """
 

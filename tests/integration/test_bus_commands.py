@@ -44,7 +44,7 @@ def drive():
         yield
 
 
-def test_scan(coe):
+def test_bus_scan_lists_slaves(coe):
     (found,) = ask("scan", interface=COE)
     assert [(row["address"], row["name"], row["vendor"]) for row in found["slaves"]] == [
         (1001, "coupler", 0xE5A),
@@ -53,7 +53,7 @@ def test_scan(coe):
     ]
 
 
-def test_objects(coe):
+def test_bus_sdo_reads_what_it_wrote(coe):
     for number in range(3):
         ask("sdo", "write", "sensor", "0x8000:1", str(number), interface=COE)
         (row,) = ask("sdo", "read", "1003", "0x8000:1", interface=COE)
@@ -64,7 +64,7 @@ def test_objects(coe):
     assert refused.stderr == "0x8000:07: subindex does not exist (0x06090011)\n"
 
 
-def test_states(coe):
+def test_bus_state_brings_all_slaves(coe):
     for state in ("OP", "PREOP", "INIT"):
         (found,) = ask("state", state, interface=COE)
         assert [row["state"] for row in found["slaves"]] == [state] * 3
@@ -82,7 +82,7 @@ def test_slave_that_is_cut_off(coe):
         coe.fault(kind="cut", slave="sensor", end=True)
 
 
-def test_files(drive, tmp_path):
+def test_bus_foe_returns_the_file_that_it_put(drive, tmp_path):
     there, back = tmp_path / "there.bin", tmp_path / "back.bin"
     there.write_bytes(bytes(range(256)) * 1000)
     for state in ("PREOP", "BOOT"):
@@ -94,7 +94,7 @@ def test_files(drive, tmp_path):
         assert back.read_bytes() == there.read_bytes()
 
 
-def test_other_protocols(drive):
+def test_bus_commands_of_other_protocols_answer(drive):
     ask("state", "drive", "PREOP", interface=DRIVE)
     ask("idn", "write", "drive", "S-0-0032", "3", interface=DRIVE)
     (row,) = ask("idn", "read", "drive", "S-0-0032", interface=DRIVE)
@@ -111,7 +111,7 @@ def test_bus_that_is_not_there():
 
 
 @pytest.mark.root
-def test_raw_ethernet(tmp_path):
+def test_bus_commands_work_by_raw_ethernet(tmp_path):
     with veth_pair(), simulator(BUSES / "drive.yaml", f"ethernet://{FAR}"):
         (found,) = ask("scan", interface=f"ethernet://{NEAR}")
         assert [row["name"] for row in found["slaves"]] == ["drive"]

@@ -175,7 +175,7 @@ def test_files_and_eeproms(works, content, tmp_path):
         (["voe", "press/bus0", "sensor", "00", "--vendor", "1"], "mailbox error"),
     ],
 )
-def test_refusals(works, words, reason):
+def test_bus_command_that_is_refused_ends_with_one_line(works, words, reason):
     done = eapctl(works, *words)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.count("\n") == 1

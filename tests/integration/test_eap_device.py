@@ -137,7 +137,7 @@ def test_aoe_reads_the_running_configuration(appliance: Appliance, left: UdpClie
             assert left.read(index, subindex).result == entry.result
 
 
-def test_aoe_refusals(appliance: Appliance, left: UdpClient) -> None:
+def test_eap_device_refuses_by_aoe_with_ads_codes(appliance: Appliance, left: UdpClient) -> None:
     assert left.read(0x2000).result == 0x70C
     assert left.read(0xD000, 200).result == 0x70C
     assert left.write(0xD000, Tx.PD_ID, b"\2\0").result == 0x712

@@ -202,7 +202,7 @@ def test_a_station_that_vanishes(mill: Appliance, press: Appliance, udp: Wire) -
         assert far.foe_read(VIRTUAL, "firmware.bin") == b"again"
 
 
-def test_ams_packets(udp: Wire) -> None:
+def test_gateway_answers_ams_packets_for_remote_slaves(udp: Wire) -> None:
     def ask(address: int, group: int, offset: int, length: int) -> bytes:
         header = (
             bytes(6) + struct.pack("<H", 1) + bytes((7, 7, 7, 7, 1, 1)) + struct.pack("<H", 900)
@@ -269,7 +269,9 @@ def test_the_command_line(mill: Appliance, press: Appliance, tmp_path: Path) -> 
         (0xF0, "64110000 0100 0102", "64110000 0100 0102"),
     ],
 )
-def test_the_dialect(udp: Wire, kind: int, body: str, answer: str) -> None:
+def test_gateway_answers_the_dialect_for_remote_slaves(
+    udp: Wire, kind: int, body: str, answer: str
+) -> None:
     octets = bytes.fromhex(body)
     mailbox = struct.pack("<HHBB", len(octets), VIRTUAL, 0, kind) + octets
     found = udp.ask(struct.pack("<H", len(mailbox) | 0x5000) + mailbox)

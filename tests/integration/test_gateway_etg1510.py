@@ -105,7 +105,7 @@ def test_gaps_are_errors_of_sdo_information(client: Wire) -> None:
         assert len(answer) == 10
 
 
-def test_whole_objects(client: Wire) -> None:
+def test_gateway_client_reads_whole_objects_of_the_master(client: Wire) -> None:
     with GatewayClient(HOST) as tool:
         known = {each.station: each for each in tool.slaves()}
     assert tuple(known) == STATIONS

@@ -142,7 +142,7 @@ def test_aoe_to_the_station_is_at_34980_alone(plant: Appliance) -> None:
         second.close()
 
 
-def test_virtual_addresses(plant: Appliance, client: Client) -> None:
+def test_gateway_answers_at_virtual_addresses(plant: Appliance, client: Client) -> None:
     assert client.ask(0x9000, VENDOR)[:6] == GIVEN
     client._sock.send(frame(0x9010, VENDOR))
     found = dict(client.answer() for _ in range(2))

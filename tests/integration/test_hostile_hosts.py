@@ -63,7 +63,7 @@ _PUBLISH = "\n".join(
     for number, (name, frame) in enumerate(PDS, 1)
 )
 PLANT = f"""\
-plant: besieged
+plant: loaded
 defaults: {{cycle_us: 10000}}
 stations:
   - name: mill
@@ -286,7 +286,7 @@ def by_gateway(port: int, *, tcp: bool) -> Client:
 
 
 def by_control(runtime: Path) -> Client:
-    (client,) = connect_those(lambda info: info.plant == "besieged" and "mill" in info.stations)
+    (client,) = connect_those(lambda info: info.plant == "loaded" and "mill" in info.stations)
     return lambda: client.request_within(LATEST_S, "read", station="mill"), client.close
 
 

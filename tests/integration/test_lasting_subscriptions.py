@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.net, pytest.mark.root]
 IS_LONG = bool(os.environ.get("EAP_LONG"))
 SUBSCRIPTIONS = 20
 RECOVERY_S = 5.0
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 """Time limit of a test for the measured event: a loaded machine is late, not wrong."""
 RUNS_US = 500_000
 """A station whose latest cycle is not older runs."""
@@ -147,11 +147,11 @@ class Line:
         os.kill(before[process], signal.SIGKILL)
         if process == "supervisor":
             station.process.wait()
-            wait_until(lambda: not any(map(is_alive, before.values())), PATIENCE_S)
+            wait_until(lambda: not any(map(is_alive, before.values())), TIMEOUT_S)
             station.close()
             self.start(name)
         else:
-            wait_until(lambda: self._runs_again(name, process, before[process]), PATIENCE_S)
+            wait_until(lambda: self._runs_again(name, process, before[process]), TIMEOUT_S)
         if name == "first" and process != "engine":
             # The connection of the client has ended, which it sees: it subscribes again.
             self.client.close()
@@ -160,7 +160,7 @@ class Line:
 
     def recovery_s(self, since_s: float) -> float:
         """Return how long it took until all subscriptions delivered."""
-        wait_until(lambda: self.client.first_samples(since_s) is not None, PATIENCE_S)
+        wait_until(lambda: self.client.first_samples(since_s) is not None, TIMEOUT_S)
         firsts = self.client.first_samples(since_s)
         assert firsts is not None
         return max(firsts) - since_s
@@ -181,7 +181,7 @@ class Line:
         self.stations[name] = self._farm.run(self._plant, "--station", name, prefix=place.prefix)
 
     def _subscribe(self) -> Client:
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = time.monotonic() + TIMEOUT_S
         while True:  # the way may not be there yet
             try:
                 return Client(self.places["first"])

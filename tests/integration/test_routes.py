@@ -96,7 +96,7 @@ def is_reached(client: AmsClient, target: str = TARGET) -> bool:
 
 
 @pytest.mark.usefixtures("chain")
-def test_two_hops() -> None:
+def test_answers_over_two_hops_return_to_their_clients() -> None:
     """Each answer comes back to who asked, long ones in fragments."""
     with AmsClient(WEST) as one, AmsClient(WEST) as other:
         wait_until(lambda: is_reached(one))

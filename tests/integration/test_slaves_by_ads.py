@@ -101,7 +101,7 @@ def test_same_values_as_locally(plant: Appliance, via: str, tmp_path: Path) -> N
         assert drive.ask(0xF430, 0, head + b"echo", 10) == head + b"echo"
 
 
-def test_sum_command(plant: Appliance) -> None:
+def test_sum_command_reads_objects_of_a_slave(plant: Appliance) -> None:
     items = b"".join(
         AdsRange(SDO, offset, 4).encode() for offset in (0x1018_0001, 0x5555_0000, 0x1018_0002)
     )
@@ -113,7 +113,7 @@ def test_sum_command(plant: Appliance) -> None:
         assert found[20:24] == b"\x52\x30\xbc\x0b"
 
 
-def test_master_groups(plant: Appliance) -> None:
+def test_master_answers_groups_of_its_bus(plant: Appliance) -> None:
     with slave((SENSOR[0], 0xFFFF), MILL) as master:
         assert master.read(6, 0, 2) == b"\3\0"
         assert master.read(7, 0, 6) == bytes.fromhex("e903 ea03 eb03")
@@ -127,7 +127,7 @@ def test_master_groups(plant: Appliance) -> None:
 
 
 @pytest.mark.parametrize("via", [MILL, SAW])
-def test_unknown_slave(plant: Appliance, via: str) -> None:
+def test_request_to_unknown_slave_is_refused(plant: Appliance, via: str) -> None:
     with slave((DRIVE[0], 1777), via) as nobody, pytest.raises(pyads.ADSError) as refused:
         nobody.u32(SDO, 0x1018_0001)
     assert refused.value.err_code == 6

@@ -128,7 +128,7 @@ def wait_for_change(locator: Locator) -> None:
 
 
 @pytest.mark.parametrize("address", VIEWS)
-def test_view_opens(tab: Callable[..., Tab], address: str):
+def test_page_shows_its_panels(tab: Callable[..., Tab], address: str):
     page = tab().open(address)
     page.locator("main h1").wait_for()
     panels = page.locator("main .panel")

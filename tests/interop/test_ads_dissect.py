@@ -82,7 +82,7 @@ def test_info_and_states(told) -> None:
     assert (number(states["ads_state"]), number(states["ads_devicestate"])) == (5, 8)
 
 
-def test_values(told) -> None:
+def test_wireshark_reads_values_of_ads_packets(told) -> None:
     request, answer = told["read"]
     assert number(request["ads_indexgroup"]) == 0x4040
     assert number(request["ads_indexoffset"]) == 16
@@ -95,7 +95,7 @@ def test_values(told) -> None:
     assert number(answer["ads_cblength"]) == number(answer["cbdata"]) - 8
 
 
-def test_notifications(told) -> None:
+def test_wireshark_reads_notifications(told) -> None:
     request, answer = told["add_notification"]
     assert number(request["ads_transmode"]) == 3
     assert number(request["ads_maxdelay"]) == 500_000

@@ -115,7 +115,7 @@ def test_nothing_is_malformed_and_each_header_is_ours(replies: list[Reply]) -> N
     assert {reply.kind for reply in replies} == {0, COE, EOE, FOE, SOE, VOE}
 
 
-def test_coe(replies: list[Reply]) -> None:
+def test_wireshark_reads_coe_replies(replies: list[Reply]) -> None:
     seen = {"service": 0, "expedited": 0, "normal": 0, "abort": 0, "info": 0}
     for reply in (each for each in replies if each.kind == MailboxType.COE):
         header = CoeHeader.decode(reply.body)
@@ -159,7 +159,7 @@ def _check_info(reply: Reply) -> None:
         assert reply.field("coe.sdoinfovalueinfo") == info
 
 
-def test_soe(replies: list[Reply]) -> None:
+def test_wireshark_reads_soe_replies(replies: list[Reply]) -> None:
     found = [each for each in replies if each.kind == MailboxType.SOE]
     for reply in found:
         head = soe.SoeHeader.decode(reply.body)
@@ -174,7 +174,7 @@ def test_soe(replies: list[Reply]) -> None:
     assert {reply.body[1] for reply in found} >= {1 << bit for bit in range(7)}
 
 
-def test_foe(replies: list[Reply]) -> None:
+def test_wireshark_reads_foe_replies(replies: list[Reply]) -> None:
     found = [each for each in replies if each.kind == MailboxType.FOE]
     for reply in found:
         header, body = foe.decode_message(reply.body)

@@ -199,7 +199,7 @@ def test_refusals_have_their_codes(plc):
         assert refused.value.err_code == code
 
 
-def test_handles(plc, served):
+def test_pyads_reads_and_writes_by_handle(plc, served):
     handle = plc.get_handle("motor.speed")
     assert plc.read_by_name("", pyads.PLCTYPE_REAL, handle=handle) == 1.5
     plc.write_by_name("", 4.0, pyads.PLCTYPE_REAL, handle=handle)
@@ -207,7 +207,7 @@ def test_handles(plc, served):
     plc.release_handle(handle)
 
 
-def test_all_symbols(plc, served):
+def test_pyads_lists_all_symbols(plc, served):
     symbols = {symbol.name: symbol for symbol in plc.get_all_symbols()}
     assert list(symbols) == list(VALUES)
     assert symbols["curve"].symbol_type == "ARRAY [0..3] OF INT"
@@ -315,7 +315,7 @@ def test_system_service_and_device_list(served):
         assert server.read(0x5002, 5, ctypes.c_uint8 * 6) == list(BUS_NET_ID)
 
 
-def test_master_groups(served):
+def test_pyads_reads_groups_of_the_master(served):
     with served.connect(net_id=str(BUS_NET_ID)) as master:
         assert master.read(3, 0x100, pyads.PLCTYPE_UINT) == 8
         assert master.read(6, 0, pyads.PLCTYPE_UINT) == 3

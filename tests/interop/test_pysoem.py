@@ -131,7 +131,7 @@ def test_sdo_read_and_write(master):
         (0x1018, 1, b"\x01\0\0\0", 0x06010002),
     ],
 )
-def test_aborts(master, index, subindex, data, code):
+def test_pysoem_gets_abort_codes(master, index, subindex, data, code):
     island = master.slaves[0]
     access = island.sdo_read if data is None else island.sdo_write
     arguments = (index, subindex) if data is None else (index, subindex, data)
@@ -151,7 +151,7 @@ def test_abort_by_a_fault(bus, master):
     island.sdo_read(0x8000, 1)
 
 
-def test_object_list(master):
+def test_pysoem_lists_objects(master):
     island = master.slaves[0]
     found = {item.index: item for item in island.od}
     assert {0x1000, 0x1018, 0x1A00, 0x1C12, 0x6000, 0x7000, 0x8000, 0x8001} <= set(found)
@@ -160,14 +160,14 @@ def test_object_list(master):
     assert names == [b"SubIndex 000", b"Gain", b"Limit"]
 
 
-def test_segmented_object(master):
+def test_pysoem_writes_and_reads_segments(master):
     island = master.slaves[0]
     curve = bytes(n * 7 % 251 for n in range(2048))
     island.sdo_write(0x8001, 0, curve)
     assert island.sdo_read(0x8001, 0, 2048) == curve
 
 
-def test_complete_access(master):
+def test_pysoem_uses_complete_access(master):
     island = master.slaves[0]
     island.sdo_write(0x8000, 1, bytes.fromhex("0a000000 0b00"), ca=True)
     assert island.sdo_read(0x8000, 0, 64, ca=True) == bytes.fromhex("0200 0a000000 0b00")
@@ -287,7 +287,7 @@ def test_value_by_command(bus, master):
     assert island.input[:2] == b"\x34\x12"
 
 
-def test_emergency(bus, master):
+def test_pysoem_gets_emergencies(bus, master):
     island = master.slaves[0]
     heard = []
     island.add_emergency_callback(heard.append)
@@ -316,7 +316,7 @@ def test_slow_eeprom_is_waited_for(bus, master):
         bus.fault(kind="eeprom", slave="drive", end=True)
 
 
-def test_eeprom(master):
+def test_pysoem_reads_the_eeprom(master):
     island = master.slaves[0]
     assert island.eeprom_read(8) == (0x1234).to_bytes(4, "little")
     assert island.eeprom_read(0x0A) == (0x5678).to_bytes(4, "little")

@@ -41,14 +41,14 @@ def assert_fields(record: WireStruct, fields: dict) -> None:
 
 
 @by_name(FRAMES)
-def test_frame_header(vector: Vector) -> None:
+def test_frame_header_equals_its_vector(vector: Vector) -> None:
     header = EtherCatHeader.decode(vector.frame)
     assert (header.type, header.length) == (vector.fields["type"], vector.fields["length"])
     assert header.encode() == vector.frame[:2]
 
 
 @by_name(of_type(FrameType.PROCESS_DATA))
-def test_process_data(vector: Vector) -> None:
+def test_process_data_equals_its_vector(vector: Vector) -> None:
     header = pd.decode_frame_header(vector.frame)
     names = ("publisher", "count", "cycle", "reserved", "eap_sm")
     assert_fields(header, {name: vector.fields[name] for name in names})
@@ -92,33 +92,33 @@ def assert_packet(octets: memoryview, fields: dict) -> None:
 
 
 @by_name(of_type(FrameType.MAILBOX))
-def test_mailbox_frame(vector: Vector) -> None:
+def test_mailbox_frame_equals_its_vector(vector: Vector) -> None:
     header, data = mailbox.decode_frame(vector.frame)
     assert_message(header, data, vector.fields["mailbox"])
     assert mailbox.encode_frame(header, data) == vector.frame[: vector.fields["length"] + 2]
 
 
 @by_name(MESSAGES)
-def test_mailbox_message(vector: Vector) -> None:
+def test_mailbox_message_equals_its_vector(vector: Vector) -> None:
     header, data = mailbox.decode_message(vector.octets)
     assert_message(header, data, vector.fields)
     assert mailbox.encode_message(header, data) == vector.octets
 
 
 @by_name(of_type(FrameType.AMS))
-def test_ams_frame(vector: Vector) -> None:
+def test_ams_frame_equals_its_vector(vector: Vector) -> None:
     assert_packet(memoryview(vector.frame)[2:], vector.fields["ams"])
 
 
 @by_name(PACKETS)
-def test_ams_packet(vector: Vector) -> None:
+def test_ams_packet_equals_its_vector(vector: Vector) -> None:
     header, data = ams.decode_packet(vector.octets)
     assert_fields(header, vector.fields)
     assert ams.encode_packet(header, data) == vector.octets
 
 
 @by_name(of_type(FrameType.DATAGRAM))
-def test_datagram_frame(vector: Vector) -> None:
+def test_datagram_frame_equals_its_vector(vector: Vector) -> None:
     datagrams = list(iter_datagrams(vector.frame))
     found = [
         {name: getattr(d.header, name) for name in ("index", "adp", "ado", "length", "irq")}
@@ -142,7 +142,7 @@ def test_message_that_its_source_cut_off_is_truncated() -> None:
 
 
 @pytest.mark.parametrize("fields", [pytest.param(item, id=name) for name, item in load_datagrams()])
-def test_captured_datagram(fields: dict) -> None:
+def test_datagram_equals_its_capture(fields: dict) -> None:
     data = bytes.fromhex(fields["data"])
     command = Command[fields["command"]]
     header = DatagramHeader(command, fields["index"], fields["adp"], fields["ado"], len(data))
@@ -155,7 +155,7 @@ def test_captured_datagram(fields: dict) -> None:
 
 
 @by_name(DISCOVERIES)
-def test_ams_discovery(vector: Vector) -> None:
+def test_discovery_datagram_equals_its_vector(vector: Vector) -> None:
     read = amsdiscovery.decode_discovery(vector.octets)
     assert_fields(read.header, vector.fields["header"])
     assert [[tag, data.hex()] for tag, data in read.tags] == vector.fields["tags"]
@@ -163,7 +163,7 @@ def test_ams_discovery(vector: Vector) -> None:
 
 
 @by_name(SECURE)
-def test_secure_ads(vector: Vector) -> None:
+def test_secure_ads_message_equals_its_vector(vector: Vector) -> None:
     read = secureads.decode_connect_info(vector.octets)
     fields = vector.fields
     login = (bytes.fromhex(fields["user"]), bytes.fromhex(fields["password"]))

@@ -79,7 +79,7 @@ def fuzz_sockets(
     dice = Random(seed)  # noqa: S311  damage, not secrets
     frames, lines = mutations(seeds, dice), mutations(_LINES, dice)
     last: deque[bytes] = deque(maxlen=_KEPT)
-    with tempfile.TemporaryDirectory() as folder, Besieged(Path(folder)) as appliance:
+    with tempfile.TemporaryDirectory() as folder, FuzzedAppliance(Path(folder)) as appliance:
         end, count = monotonic() + seconds, 0
         while monotonic() < end:
             for _ in range(_BETWEEN_LOOKS):
@@ -93,7 +93,7 @@ def fuzz_sockets(
     return count, None
 
 
-class Besieged:
+class FuzzedAppliance:
     """A running appliance and the connections to it; a context manager."""
 
     processes: dict[str, Any]

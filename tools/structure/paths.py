@@ -34,7 +34,7 @@ Calls: TypeAlias = Counter[tuple[str, str]]
 READS = 50
 SETS = 5
 _NEARLY_ALWAYS, _HARDLY_EVER = 0.8, 0.2
-_PATIENCE_S = 60
+_TIMEOUT_S = 60
 _TRACED = re.compile(rb"eap\.(engine|services)\.process")
 _BUS, _ADDRESS = bytes((127, 0, 1, 1, 3, 1)), "127.0.1.1"
 """The first bus of ``config/demo.yaml``, and the address of its station."""
@@ -43,7 +43,7 @@ _BUS, _ADDRESS = bytes((127, 0, 1, 1, 3, 1)), "127.0.1.1"
 def trace_paths(root: Path) -> list[Row]:
     """Run the demo plant of the checkout in *root*; return the length of its paths."""
     with tempfile.TemporaryDirectory(prefix="structure-") as folder, _run(root, folder) as plant:
-        with socket.create_connection((_ADDRESS, 48898), timeout=_PATIENCE_S) as connection:
+        with socket.create_connection((_ADDRESS, 48898), timeout=_TIMEOUT_S) as connection:
             sdo = plant.trace(lambda: _read_sdo(connection), READS)
         pd_set = plant.trace(plant.set_value, SETS)
     return [
@@ -218,7 +218,7 @@ def read_calls(path: Path) -> Calls:
 
 
 def _wait(is_true: Callable[[], bool]) -> None:
-    end = time.monotonic() + _PATIENCE_S
+    end = time.monotonic() + _TIMEOUT_S
     while not is_true():
         if time.monotonic() > end:
             raise TimeoutError("the demo plant does not answer: is another one running?")

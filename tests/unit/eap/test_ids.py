@@ -57,12 +57,12 @@ def test_mac_round_trip(octets: bytes) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "01:02:03:04:05", "01:02:03:04:05:0g", "010203040506"])
-def test_mac_refused(text: str) -> None:
+def test_wrong_mac_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is not a MAC address"):
         MacAddr.parse(text)
 
 
-def test_group_addresses() -> None:
+def test_group_addresses_are_known_as_such() -> None:
     assert BROADCAST_MAC.is_group
     assert EAP_MULTICAST_MAC.is_group
     assert not MacAddr.parse("02:01:05:00:00:01").is_group
@@ -83,7 +83,7 @@ def test_interface_round_trip(text: str) -> None:
     assert str(InterfaceUri.parse(text)) == text
 
 
-def test_interface_parts() -> None:
+def test_interface_is_read_by_its_parts() -> None:
     uri = InterfaceUri.parse("udp://127.0.1.1:40000")
     assert (uri.scheme, uri.host, uri.port, uri.options) == ("udp", "127.0.1.1", 40000, ())
     assert uri == InterfaceUri("udp", "127.0.1.1", 40000)
@@ -103,7 +103,7 @@ def test_interface_parts() -> None:
         ("loop://a?loss", "bad query field"),
     ],
 )
-def test_interface_refused(text: str, reason: str) -> None:
+def test_wrong_interface_is_refused(text: str, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         InterfaceUri.parse(text)
 
@@ -136,7 +136,7 @@ def test_net_ids_of_a_station_have_a_beginning_in_common() -> None:
         ("tcp://127.0.1.1", False),
     ],
 )
-def test_destination_group(text: str, is_group: bool) -> None:
+def test_destination_is_known_as_group(text: str, is_group: bool) -> None:
     assert Destination.parse(text).is_group is is_group
 
 
@@ -153,7 +153,7 @@ def test_destination_mac_has_one_spelling() -> None:
 @pytest.mark.parametrize(
     "text", ["", "host", "1.2.3", "1.2.3.4:x", "01:02:03:04:05:zz", "tcp://eth0"]
 )
-def test_destination_refused(text: str) -> None:
+def test_wrong_destination_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is not a"):
         Destination.parse(text)
 

@@ -19,7 +19,7 @@ from eap import quantities
         (7_200_000_000, "2 h"),
     ],
 )
-def test_duration(us: int | None, text: str) -> None:
+def test_duration_has_a_fitting_unit(us: int | None, text: str) -> None:
     assert quantities.duration(us) == text
 
 
@@ -50,5 +50,5 @@ def test_age_of_a_time_to_come_is_none() -> None:
         (4 * 10**9, "4.0 GB"),
     ],
 )
-def test_size(number: int, text: str) -> None:
+def test_size_has_a_fitting_unit(number: int, text: str) -> None:
     assert quantities.size(number) == text

@@ -110,7 +110,7 @@ def test_device_has_the_fields_of_its_file():
         ('\ufeff<?xml version="1.0" encoding="UTF-8"?>', "utf-8"),
     ],
 )
-def test_encodings(head, encoding):
+def test_esi_file_is_read_in_its_encoding(head, encoding):
     text = esi('<Device><Type ProductCode="1">X</Type><Name>250 µs</Name></Device>').decode()
     xml = head + text.partition("?>")[2]
     assert load(xml.encode(encoding)).device.name == "250 µs"

@@ -63,7 +63,7 @@ def test_esi_skips_common_objects_and_unknown_types(found):
     assert sorted(found) == [0x8000, 0x8010, 0x8012, 0x8013, 0x8014]
 
 
-def test_record(found):
+def test_esi_record_has_its_entries(found):
     assert [
         (each.subindex, each.name, each.type, each.default, each.access)
         for each in found[0x8000].entries
@@ -74,13 +74,13 @@ def test_record(found):
     ]
 
 
-def test_array(found):
+def test_esi_array_has_its_elements(found):
     assert [(each.subindex, each.type, each.access) for each in found[0x8010].entries] == [
         (sub, "INT", RO) for sub in (1, 2, 3)
     ]
 
 
-def test_variables(found):
+def test_esi_variables_have_types_and_defaults(found):
     entries = [found[index].entries[0] for index in (0x8012, 0x8013, 0x8014)]
     assert [(each.type, each.default, each.access) for each in entries] == [
         ("STRING(4)", b"abc\0", RW),
@@ -93,7 +93,7 @@ def test_variables(found):
     ("name", "bits", "kind"),
     [("INT", 16, "INT"), ("INT", 32, "UDINT"), ("", 3, "BIT3"), ("DT1", 24, "BLOCK(3)")],
 )
-def test_types(name, bits, kind):
+def test_esi_type_is_that_of_name_and_bits(name, bits, kind):
     assert type_of(name, bits) == kind
 
 

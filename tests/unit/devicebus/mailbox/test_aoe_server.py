@@ -81,7 +81,7 @@ def test_read_and_write_in_one(server):
     assert got.data == OK + u32(2) + b"\5\6"
 
 
-def test_complete_access(server):
+def test_aoe_server_reads_and_writes_whole_objects(server):
     whole = call(server, AmsCommand.READ, 0xF302, 0x2000_0100, 6).data
     assert whole == OK + u32(6) + bytes.fromhex("0200 0100 0200")
     data = bytes.fromhex("0200 0300 0400")
@@ -89,7 +89,7 @@ def test_complete_access(server):
     assert call(server, AmsCommand.READ, 0xF302, 0x2000_0100, 6).data[8:] == data
 
 
-def test_descriptions(server, dictionary):
+def test_aoe_server_describes_objects(server, dictionary):
     for offset, group, expected in (
         (0, 0xF3FC, info.object_list(dictionary, 0)),
         (0x0001_0000, 0xF3FC, info.object_list(dictionary, 1)),

@@ -190,7 +190,7 @@ def test_upload_without_answer_times_out() -> None:
         ),
     ],
 )
-def test_download(data: bytes, complete: bool, sent: list[str]) -> None:
+def test_coe_client_downloads_in_segments(data: bytes, complete: bool, sent: list[str]) -> None:
     answers = ["0030 60 1810 01 00000000", "0030 20 00000000000000", "0030 30 00000000000000"]
     progress = Progress()
     talk = coe_client.download(0x1018, 1, data, SIZES, complete=complete, progress=progress)
@@ -371,7 +371,7 @@ def serve_info(size: int = 128, seed: int | None = None) -> Line:
 
 @pytest.mark.parametrize("size", [16, 40, 256])
 @pytest.mark.parametrize("seed", [None, 3])
-def test_lists(size: int, seed: int | None) -> None:
+def test_coe_client_reads_lists_in_fragments(size: int, seed: int | None) -> None:
     line = serve_info(size, seed)
     assert line.run(coe_client.object_list()) == [*range(0x2000, 0x2064), 0x6000]
     assert line.run(coe_client.object_list(ListType.TX_MAPPABLE)) == [0x6000]
@@ -380,7 +380,7 @@ def test_lists(size: int, seed: int | None) -> None:
 
 
 @pytest.mark.parametrize("size", [16, 128])
-def test_descriptions(size: int) -> None:
+def test_coe_client_reads_descriptions(size: int) -> None:
     line = serve_info(size)
     described = line.run(coe_client.object_description(0x6000))
     assert described == ObjectDescription(0x6000, 3, 1, 9, "Inputs")

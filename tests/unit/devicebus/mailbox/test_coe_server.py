@@ -79,7 +79,7 @@ class Slave:
         ("50 121c 00 00000000", "5b 12 1c 00 00 00 00 00"),
     ],
 )
-def test_upload(asked: str, answer: str) -> None:
+def test_coe_server_answers_upload(asked: str, answer: str) -> None:
     assert Slave().ask(asked) == answer
 
 
@@ -93,7 +93,7 @@ def test_upload(asked: str, answer: str) -> None:
         ("21 0810 00 00000000", "60 08 10 00 00 00 00 00", 0x1008, b""),
     ],
 )
-def test_download(asked: str, answer: str, index: int, stored: bytes) -> None:
+def test_coe_server_stores_download(asked: str, answer: str, index: int, stored: bytes) -> None:
     slave = Slave()
     assert slave.ask(asked) == answer
     assert slave.dictionary.entry(index, 0).octets == stored
@@ -145,7 +145,7 @@ def test_state_of_the_slave_counts() -> None:
     assert slave.abort_code("21 0220 00 32000000" + "00" * 50) is AbortCode.DEVICE_STATE
 
 
-def test_segmented_upload() -> None:
+def test_coe_server_uploads_in_segments() -> None:
     slave = Slave(to_master=32)
     assert slave.ask("40 0220 00 00000000") == f"41 02 20 00 32 00 00 00 {octets(0, 16)}"
     assert slave.ask("60 00000000000000") == f"00 {octets(16, 39)}"
@@ -162,7 +162,7 @@ def test_sdo_server_short_last_segment_has_its_unused_count() -> None:
     assert slave.ask("60 00000000000000") == "07 64 65 66 67 00 00 00"
 
 
-def test_segmented_download() -> None:
+def test_coe_server_takes_segments() -> None:
     slave = Slave()
     assert slave.ask(f"21 0220 00 32000000 {octets(50, 80)}") == "60 02 20 00 00 00 00 00"
     assert slave.ask(f"00 {octets(80, 90)}") == "20 00 00 00 00 00 00 00"
@@ -269,7 +269,7 @@ def ask_info(octets: str, size: int = 128) -> list[str]:
     return answers
 
 
-def test_list() -> None:
+def test_coe_server_lists_objects() -> None:
     assert ask_info("01 00 0000 0300") == ["02 00 00 00 03 00 00 60"]
     assert ask_info("01 00 0000 0000") == ["02 00 00 00 00 00 2a 00 00 00 01 00 00 00 00 00"]
 
@@ -287,13 +287,13 @@ def test_list_in_fragments_that_count_down() -> None:
     assert listed == b"".join(number.to_bytes(2, "little") for number in [1, *indexes])
 
 
-def test_object_description() -> None:
+def test_coe_server_describes_object() -> None:
     assert ask_info("03 00 0000 0010") == [
         "04 00 00 00 00 10 07 00 00 07 " + b"Device type".hex(" ")
     ]
 
 
-def test_entry_description() -> None:
+def test_coe_server_describes_entry() -> None:
     assert ask_info("05 00 0000 0060 01 7f") == [
         "06 00 00 00 00 60 01 57 03 00 10 00 87 00 00 00 09 00 " + b"Level".hex(" ")
     ]

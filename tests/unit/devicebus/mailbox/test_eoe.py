@@ -45,7 +45,7 @@ def test_eoe_fragments_as_the_vector() -> None:
 
 
 @given(st.binary(min_size=1, max_size=MAX_FRAME), st.integers(32, 1600), st.integers(0, 15))
-def test_round_trip(frame: bytes, room: int, number: int) -> None:
+def test_frame_survives_its_fragments(frame: bytes, room: int, number: int) -> None:
     messages = fragments(frame, number, room)
     assert all(len(message) <= room + 4 for message in messages)
     assert receive(FrameAssembler(), *messages) == [frame]
@@ -122,7 +122,7 @@ EOE = MailboxType.EOE
 SET_IP, SET_IP_RESPONSE, SET_IP_FRAME = [vector.octets[6:] for vector in load("eoe_mailbox")][:3]
 
 
-def test_captured_exchange() -> None:
+def test_ip_settings_are_sent_as_captured() -> None:
     settings = IpSettings.decode(SET_IP[4:])
     _, asked = run_with(EOE, eoe.set_ip(settings), [SET_IP_FRAME, SET_IP_RESPONSE])
     assert asked == [SET_IP]

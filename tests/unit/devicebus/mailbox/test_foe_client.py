@@ -73,7 +73,7 @@ def test_read_ends_with_an_empty_packet() -> None:
         (b"abcdef", ["03 00 01 00 00 00 61 62 63 64", "03 00 02 00 00 00 65 66"]),
     ],
 )
-def test_write(data: bytes, packets: list[str]) -> None:
+def test_foe_client_writes_in_packets(data: bytes, packets: list[str]) -> None:
     progress = Progress(len(data))
     answers = [f"04 00 0{number}000000" for number in range(len(packets) + 1)]
     assert write(data, answers, progress=progress) == ["02 00 00 00 00 00 66", *packets]

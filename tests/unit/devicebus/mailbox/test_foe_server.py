@@ -122,7 +122,7 @@ def test_message_without_a_transfer_is_illegal(octets: str) -> None:
     assert Slave().error(octets) is FoeErrorCode.ILLEGAL
 
 
-def test_password_decides() -> None:
+def test_foe_server_refuses_wrong_password() -> None:
     assert Slave().error("01 00 00000000 736563726574") is FoeErrorCode.NO_RIGHTS
     assert Slave().ask("01 00 78563412 736563726574 00") == "03 00 01 00 00 00"
 

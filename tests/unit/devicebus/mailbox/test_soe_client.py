@@ -110,7 +110,7 @@ def test_soe_client_endless_fragments_end_with_the_limit() -> None:
         ),
     ],
 )
-def test_write(data: bytes, sent: list[str]) -> None:
+def test_soe_client_writes_in_fragments(data: bytes, sent: list[str]) -> None:
     progress = Progress()
     talk = soe_client.write(MODE, data, SIZES, drive=1, progress=progress)
     _, asked = run_with(SOE, talk, ["24 40 2000"])

@@ -129,7 +129,7 @@ def number(value: int) -> bytes:
         (Element.VALUE | Element.UNIT | Element.MINIMUM, "0300 0300 72706d 9cffffff fbffffff"),
     ],
 )
-def test_elements(element: int, octets: str) -> None:
+def test_soe_parameter_has_its_elements(element: int, octets: str) -> None:
     assert speed().read(element, 0) == bytes.fromhex(octets)
 
 
@@ -226,7 +226,7 @@ def test_text_is_a_list_of_octets() -> None:
     assert parameter.octets == b"ABA"
 
 
-def test_empty_list() -> None:
+def test_soe_parameter_reads_empty_list() -> None:
     parameter = SoeParameter("S-0-0016", "", LIST, max_length=4)
     assert parameter.read(Element.VALUE, 0) == bytes.fromhex("0000 0400")
 

@@ -73,7 +73,7 @@ def test_slave_that_an_abort_makes_deaf(line, monkeypatch):
             assert bus.converse(unit, REQUESTS["coe"], "request") == (0xE5A).to_bytes(4, "little")
 
 
-def test_boot_mailbox(line):
+def test_attach_in_boot_uses_the_boot_mailbox(line):
     for _ in range(2):
         with line.session() as bus:
             unit = bus.find("foe")

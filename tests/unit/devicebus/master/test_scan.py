@@ -24,7 +24,7 @@ def status(*ports):
 
 
 @pytest.mark.parametrize("ports", [(), (0,), (0, 1), (0, 1, 2, 3)])
-def test_open_ports(ports):
+def test_open_ports_are_those_of_dl_status(ports):
     assert open_ports(status(*ports)) == ports
 
 
@@ -32,7 +32,7 @@ def parents(*ports):
     return [(node.parent, node.parent_port) for node in find_topology([status(*p) for p in ports])]
 
 
-def test_a_line():
+def test_slaves_of_a_line_have_one_parent_each():
     assert parents((0, 1), (0, 1), (0,)) == [(None, 0), (0, 1), (1, 1)]
 
 

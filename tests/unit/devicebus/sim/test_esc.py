@@ -23,7 +23,7 @@ LARGE = access_map(8, 16, has_dc=True)
         (0x081E, 1, 1), (0x081F, 1, 0), (0x0820, 0, 0), (0x0910, 0, 0), (0x0FFF, 0, 0),
     ],
 )  # fmt: skip
-def test_small_controller(address, readable, writable):
+def test_small_controller_has_no_such_register(address, readable, writable):
     assert (SMALL.readable[address], SMALL.writable[address]) == (readable, writable)
 
 
@@ -50,7 +50,7 @@ def esc():
     return Esc(IMAGE, EscSettings(fmmus=3, sync_managers=4))
 
 
-def test_describes_itself(esc):
+def test_esc_describes_itself_in_registers(esc):
     assert esc.read(0, 10, 0) == bytes.fromhex("1100 0200 03 04 08 0f 0c00")
     assert esc.read(0x0012, 2, 0) == b"\x34\x12"
     assert esc.read(0x0140, 2, 0) == b"\x05\x08"
@@ -206,7 +206,7 @@ def test_loop_control_is_noted_for_the_wiring(esc):
     assert [esc.loop_control(port) for port in range(4)] == [0, 3, 0, 0]
 
 
-def test_clock_registers(esc):
+def test_esc_latches_port_times(esc):
     esc.port_delays, esc.processing_delay = (100, 900, None, None), 100
     esc.read(0x0910, 8, 0)
     esc.write(0x0900, bytes(4), 1000)

@@ -44,7 +44,7 @@ def switch(bench, kind, *, on=True, **more):
     SLAVE_FAULTS[spec.kind](bench.slaves[0], spec, bench.now_ns, on)
 
 
-def test_stuck_mailbox(bench):
+def test_mailbox_fault_takes_messages_and_gives_none(bench):
     switch(bench, "mailbox")
     assert (bench.post(UPLOAD), bench.fetch().wkc, bench.post(UPLOAD)) == (1, 0, 0)
     switch(bench, "mailbox", on=False)
@@ -53,7 +53,7 @@ def test_stuck_mailbox(bench):
     assert bench.fetch().wkc == 1
 
 
-def test_aborted_object(bench):
+def test_sdo_fault_aborts_one_object(bench):
     switch(bench, "sdo", object="0x1018", code=0x06000000)
     bench.post(UPLOAD)
     assert bench.fetch().data[:16] == ABORTED
@@ -62,7 +62,7 @@ def test_aborted_object(bench):
     assert bench.fetch().data[8] == 0x43
 
 
-def test_slow_files(bench):
+def test_foe_fault_delays_packets(bench):
     server = bench.slaves[0].device.mailbox.protocols[MailboxType.FOE]
     switch(bench, "foe", delay_us=1500)
     assert server.packet_time_ns == 1_500_000
@@ -70,7 +70,7 @@ def test_slow_files(bench):
     assert server.packet_time_ns == 0
 
 
-def test_refused_files(bench):
+def test_foe_fault_refuses_files(bench):
     server = bench.slaves[0].device.mailbox.protocols[MailboxType.FOE]
     switch(bench, "foe", code=0x8007)
     (answer,) = server.receive_message(b"\1\0\0\0\0\0firmware.bin", 0)
@@ -109,7 +109,7 @@ def test_emergency_needs_coe():
     assert bench.status() == (AlState.INIT, 0)
 
 
-def test_refused_state(bench):
+def test_state_fault_refuses_one_state(bench):
     switch(bench, "refuse", state="INIT")
     bench.ask(AlState.INIT)
     assert bench.status() == (AlState.PREOP | ERROR, AlStatusCode.UNSPECIFIED)
@@ -118,7 +118,7 @@ def test_refused_state(bench):
     assert bench.status() == (AlState.INIT, 0)
 
 
-def test_drift(bench):
+def test_drift_fault_changes_the_clock(bench):
     clock = bench.slaves[0].esc.clock
     clock.local_time(0)
     switch(bench, "drift", drift_ppm=100.0)
@@ -433,7 +433,7 @@ def test_faults_begin_and_end(commanded):
         (b'{"kind": "tx-pdo", "slave": "slave", "object": "0x1600"}', "is no TxPDO"),
     ],
 )
-def test_fault_refusals(commanded, command, reason):
+def test_unknown_fault_is_refused(commanded, command, reason):
     with pytest.raises(ValueError, match=reason):
         obey(FaultySegment(commanded.segment), command, 0)
 

@@ -38,7 +38,9 @@ def test_datagram_matches_wire_layout() -> None:
 
 
 @given(headers, tag_lists, st.binary(max_size=9))
-def test_round_trip(header: DiscoveryHeader, tags: list, surplus: bytes) -> None:
+def test_discovery_datagram_survives_its_bytes(
+    header: DiscoveryHeader, tags: list, surplus: bytes
+) -> None:
     octets = encode_discovery(header, tags)
     read = decode_discovery(octets + surplus)
     assert list(read.tags) == tags

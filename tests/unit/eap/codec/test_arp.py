@@ -35,7 +35,9 @@ def test_answer_to_probe_shows_owner_of_address() -> None:
 
 
 @given(st.integers(0, 0xFFFF), macs, addresses, macs, addresses, st.integers(0, 20))
-def test_round_trip(operation, sender_mac, sender, target_mac, target, padding) -> None:
+def test_arp_packet_survives_its_bytes(
+    operation, sender_mac, sender, target_mac, target, padding
+) -> None:
     message = ArpMessage(operation, sender_mac, sender, target_mac, target)
     data = bytes(padding) + message.encode() + bytes(18)
     assert ArpMessage.decode(data, padding) == message

@@ -30,7 +30,7 @@ def build(items: list[tuple[int, int, int, bytes]], cycle: int = 7) -> bytes:
 
 
 @given(pds, words)
-def test_round_trip(items: list[tuple[int, int, int, bytes]], cycle: int) -> None:
+def test_pd_frame_survives_its_bytes(items: list[tuple[int, int, int, bytes]], cycle: int) -> None:
     frame = build(items, cycle)
     assert decode_frame_header(frame) == PdFrameHeader(PUBLISHER, len(items), cycle)
     read = [(pd.pd_id, pd.version, pd.quality, bytes(data)) for pd, data in iter_pds(frame)]

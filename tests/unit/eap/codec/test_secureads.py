@@ -41,7 +41,7 @@ def test_layout_has_64_bytes() -> None:
 
 
 @given(infos, st.binary(max_size=9))
-def test_round_trip(info: ConnectInfo, surplus: bytes) -> None:
+def test_connect_info_survives_its_bytes(info: ConnectInfo, surplus: bytes) -> None:
     octets = info.encode()
     assert length_of(octets) == len(octets) <= MAX_LENGTH
     assert decode_connect_info(octets + surplus) == info

@@ -87,7 +87,7 @@ def test_decode_starts_at_the_offset_and_ignores_the_rest() -> None:
 
 
 @given(any_record, st.binary(max_size=3), st.sampled_from((bytes, bytearray, memoryview)))
-def test_round_trip(record: WireStruct, before: bytes, form: type) -> None:
+def test_record_survives_its_bytes(record: WireStruct, before: bytes, form: type) -> None:
     octets = record.encode()
     assert len(octets) == record.SIZE
     assert type(record).decode(form(before + octets), len(before)) == record

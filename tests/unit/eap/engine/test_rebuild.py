@@ -53,7 +53,7 @@ def replacement(place, **changes):
     return StationReplacement(place, replace(place.station.spec, **changes), NO_BUSES)
 
 
-PATIENCE_MS = 10_000
+TIMEOUT_MS = 10_000
 
 
 class Running:
@@ -261,17 +261,17 @@ def test_accounts_that_part_while_something_is_built_are_looked_at_again(running
 
 def test_the_swap_waits_for_the_next_cycle_when_that_is_near(running):
     number = running.post(wider(running.left))
-    select.select([running.plant.rebuilder], [], [], PATIENCE_MS / 1000)
+    select.select([running.plant.rebuilder], [], [], TIMEOUT_MS / 1000)
     due_ns = running.plant.engine.next_timeout()
     running.plant.rebuilder.collect(due_ns - 100_000)
     assert number not in running.answers
     running.cycles()
     assert running.answers[number] is None
     while running.plant.rebuilder.is_building:  # it clears up what has been replaced
-        select.select([running.plant.rebuilder], [], [], PATIENCE_MS / 1000)
+        select.select([running.plant.rebuilder], [], [], TIMEOUT_MS / 1000)
         running.plant.rebuilder.collect(due_ns)
     number = running.post(running.left)
-    select.select([running.plant.rebuilder], [], [], PATIENCE_MS / 1000)
+    select.select([running.plant.rebuilder], [], [], TIMEOUT_MS / 1000)
     running.plant.rebuilder.collect(running.plant.engine.next_timeout() - 2_000_000)
     assert running.answers[number] is None
 

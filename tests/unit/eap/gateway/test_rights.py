@@ -1,4 +1,4 @@
-"""Mailbox requests as operations that rules judge."""
+"""Mailbox requests as operations, for access rules."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def far(target):
         yield AdsOd(device)
 
 
-def test_objects(far):
+def test_od_by_ads_lists_objects(far):
     names = {each.index: (each.name, each.code, each.max_subindex) for each in far.objects()}
     assert names[0xD000] == ("TxPD 0", "RECORD", 7)
 
@@ -37,7 +37,7 @@ def test_list_without_objects(far, monkeypatch, octets):
     assert far.objects() == []
 
 
-def test_description(far):
+def test_od_by_ads_describes_entries(far):
     found = far.describe(0xD000)
     cycle = next(each for each in found.entries if each.subindex == 7)
     assert (cycle.kind and cycle.kind.text, cycle.access) == ("UDINT", "rw")
@@ -54,7 +54,7 @@ def test_read_and_write(far):
         far.write(0xD000, 1, whole[2:], complete=True)
 
 
-def test_refusals(far, target):
+def test_od_by_ads_raises_refusals(far, target):
     with pytest.raises(AmsRefusedError, match=r"0x9999:00: there is no such object or entry"):
         far.read(0x9999, 0)
     target.error = 0x1B
@@ -62,6 +62,6 @@ def test_refusals(far, target):
         far.entry(0xD000, 7)
 
 
-def test_contents(far):
+def test_od_by_ads_reads_contents(far):
     found = {(each.object.index, each.entry.subindex): each for each in far.contents()}
     assert found[0xD000, 7].octets == far.read(0xD000, 7)

@@ -19,7 +19,7 @@ from tests.support.oddevice import MemoryDevice, mixer
 CONFIG = Path(__file__).parents[4] / "config"
 
 
-def test_order():
+def test_loaded_entries_are_written_in_order():
     indexes = [0xF800, 0x8000, 0xE000, 0xD000, 0x1A00, 0x2000, 0x7001, 0x6000, 0x1600]
     device = MemoryDevice(
         ObjectDictionary(

@@ -36,7 +36,7 @@ def station(answers, tmp_path, monkeypatch):
             yield StationOd(client, "mixer/eap0")
 
 
-def test_descriptions(station, device):
+def test_od_of_station_describes_as_its_device(station, device):
     assert station.objects() == device.objects()
     assert station.describe(0x8000) == device.describe(0x8000)
     assert station.entry(0xD000, 7) == device.entry(0xD000, 7)
@@ -53,7 +53,7 @@ def test_read_and_write(station, device):
     assert list(station.contents()) == device.contents()
 
 
-def test_refusal(station):
+def test_od_of_station_raises_abort(station):
     with pytest.raises(ControlError, match=r"0x1000:00.*0x06010002") as caught:
         station.write(0x1000, 0, bytes(4))
     assert caught.value.code == "abort"

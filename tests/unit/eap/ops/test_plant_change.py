@@ -89,7 +89,7 @@ def test_stations_are_chosen(plant, link):
         choose(more, link, ["spare"])
 
 
-def test_nothing_differs(plant, link):
+def test_plan_of_the_same_plant_has_no_steps(plant, link):
     wanted = choose(plant, link, ())
     assert not any(each.differs for each in plan_all(link, wanted))
     assert steps_to(link, wanted) == []

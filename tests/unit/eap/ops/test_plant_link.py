@@ -43,7 +43,7 @@ def test_a_blank_station_belongs_to_whoever_has_one_of_its_name(stack):
         assert link.stations == ("mixer",)
 
 
-def test_nothing_runs(stack):
+def test_link_without_a_running_plant_is_refused(stack):
     PlantStub("hall", [station("mixer")], stack)
     with pytest.raises(ControlError, match=r"no station of plant line runs here.*run line\.yaml"):
         link_to(PLANT, FILE).__enter__()
@@ -56,7 +56,7 @@ def test_plan_refuses_another_duty_of_the_audit(stack):
     assert plan.refused == ["access: audit becomes required: restart the appliance"]
 
 
-def test_requests(stack):
+def test_link_passes_requests_to_the_station(stack):
     stub = PlantStub("line", PLANT.stations, stack)
     faster = replace(PLANT.stations[0], cycle_us=5000)
     with link_to(PLANT, FILE) as link:

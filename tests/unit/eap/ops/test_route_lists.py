@@ -42,7 +42,7 @@ def test_routes_that_went_away_meanwhile_end_the_pages(fake):
     assert listed.total == 2
 
 
-def test_no_appliance(runtime):
+def test_routes_without_an_appliance_are_refused(runtime):
     with pytest.raises(ControlError, match="no appliance runs"):
         list_routes(None, None)
 

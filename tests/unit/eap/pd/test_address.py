@@ -18,7 +18,7 @@ hosts = st.builds(str.__add__, st.ip_addresses(v=4).map(str), ports)
 
 
 @given(macs | hosts | hosts.map("tcp://".__add__))
-def test_round_trip(text: str) -> None:
+def test_destination_survives_a_word(text: str) -> None:
     word = to_word(text)
     assert 0 < word < 1 << 63
     assert from_word(word) == Destination.parse(text)

@@ -207,7 +207,7 @@ def check_pds(
 
 
 def check_trackers(old: Image, new: Image) -> None:
-    """They are shared by those who shared them and are judged alike, and by nobody else."""
+    """Check that PDs share a tracker only where they shared one, and have the same limits."""
     then, now = shared(old), shared(new)
     before = {slot.name: slot for slot in old.layout.rx}
     for slot in new.layout.rx:
@@ -215,7 +215,7 @@ def check_trackers(old: Image, new: Image) -> None:
             if {slot.name, other.name} <= before.keys():
                 together = (
                     then[slot.name] == then[other.name]
-                    and judged(slot) == judged(other)
+                    and limits_of(slot) == limits_of(other)
                     and stays(before[slot.name], slot) == stays(before[other.name], other)
                 )
                 assert (now[slot.name] == now[other.name]) == together
@@ -231,7 +231,7 @@ def stays(was: RxSlot, slot: RxSlot) -> bool:
     return (was.publisher, was.step) == (slot.publisher, slot.step)
 
 
-def judged(slot: RxSlot) -> tuple[object, ...]:
+def limits_of(slot: RxSlot) -> tuple[object, ...]:
     return slot.publisher, slot.step, slot.sender_cycle_us, slot.timeout_ms
 
 

@@ -120,7 +120,7 @@ def test_tx_slot_by_schedule_is_false_with_other_triggers():
     st.lists(TYPES, min_size=1, max_size=6),
     st.lists(st.tuples(st.sampled_from(Writer), TYPES), max_size=6),
 )
-def test_nothing_overlaps(pd_types, others):
+def test_places_of_variables_do_not_overlap(pd_types, others):
     variables = received(*(f"r{i}:{kind}" for i, kind in enumerate(pd_types)))
     names = tuple(variable.name for variable in variables)
     for i, (writer, kind) in enumerate(others):

@@ -83,7 +83,7 @@ def test_monitor_probes_sooner_in_doubt() -> None:
     assert run.presence() is MISSING
 
 
-def test_comes_back() -> None:
+def test_subscriber_that_comes_back_is_present() -> None:
     run = Run(target())
     run.until(10 * SECOND)
     run.until(12 * SECOND, lambda _: THEIRS)

@@ -97,7 +97,7 @@ def spec(count: int) -> StationSpec:
 @pytest.mark.parametrize(
     "count", [0, 1, RECORDS_PER_STEP, RECORDS_PER_STEP + 1, 3 * RECORDS_PER_STEP - 1]
 )
-def test_both_ways(count):
+def test_specification_survives_lines(count):
     given = spec(count)
     assert record_from_lines(record_to_lines(given), StationSpec) == given
     layout = plan_layout(given)

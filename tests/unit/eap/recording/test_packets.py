@@ -14,7 +14,7 @@ frames = st.lists(
 )
 
 
-def test_ethernet() -> None:
+def test_unwrap_takes_ethernet_headers_off() -> None:
     packet = unwrap(ethernet(FRAME))
     assert packet is not None
     assert packet.payload.startswith(FRAME)
@@ -22,7 +22,7 @@ def test_ethernet() -> None:
 
 
 @pytest.mark.parametrize(("tag", "vlan_id"), [(0xE000, 0), (0x2005, 5)])
-def test_tagged_ethernet(tag: int, vlan_id: int) -> None:
+def test_unwrap_takes_vlan_tags_off(tag: int, vlan_id: int) -> None:
     packet = unwrap(ethernet(FRAME, vlan=tag))
     assert packet is not None
     assert packet.payload.startswith(FRAME)
@@ -44,7 +44,7 @@ def test_padding_behind_an_ip_packet_is_not_payload() -> None:
     assert packet.payload == b""
 
 
-def test_tcp() -> None:
+def test_unwrap_takes_tcp_headers_off() -> None:
     packet = unwrap(tcp_segment(FRAME, 77))
     assert packet is not None
     assert (packet.payload, packet.segment) == (FRAME, TcpSegment(77, is_first=False))

@@ -28,11 +28,11 @@ UP = BusReport(is_up=True, slaves=(slave(8), LOST), cycles=7)
         (BusReport(is_up=False, slaves=(slave(8),)), "down"),
     ],
 )
-def test_link(report, link):
+def test_bus_link_says_whether_slaves_answer(report, link):
     assert bus_link(report) == link
 
 
-def test_document():
+def test_bus_document_has_the_counters():
     report = msgspec.structs.replace(
         UP, wkc_errors=1, cycles_lost=2, cycles_late=3, cycles_skipped=4, trip_ns=1999,
         frames_sent=90, frames_received=80, frames_late=5, frames_lost=6, frames_retried=7,

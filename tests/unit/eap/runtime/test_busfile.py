@@ -70,7 +70,7 @@ def test_file_with_its_resources(tmp_path):
         ("name: b", "name: b\n    port: 4", "5: port is 4; expected a whole number from 1 to 3"),
     ],
 )
-def test_finding(tmp_path, old, new, finding):
+def test_wrong_bus_file_is_a_finding_with_line(tmp_path, old, new, finding):
     result = busfile.load(write(tmp_path, GOOD.replace(old, new, 1)))
     assert result.bus is None
     found = [str(each).removeprefix(f"{tmp_path}/bus.yaml:") for each in result.findings]

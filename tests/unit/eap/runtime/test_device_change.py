@@ -138,7 +138,7 @@ def with_port(spec, **changes):
     return replace(spec, ports=(replace(spec.ports[0], **changes),))
 
 
-def test_same_specification(plain):
+def test_same_specification_has_no_differences(plain):
     assert find_refusals(plain, plain) == []
     assert describe_rest(plain, plain) == []
 

@@ -49,7 +49,7 @@ SLAVE = SlaveReport(
         SetState(id=8, station="one", state=4),
     ],
 )
-def test_requests(request_):
+def test_engine_request_survives_msgpack(request_):
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(request_), type=EngineRequest) == request_
 
 
@@ -64,7 +64,7 @@ def test_requests(request_):
         EngineReply(id=5, report=BusReport(is_up=True, slaves=(SLAVE,), cycles=9)),
     ],
 )
-def test_answers(message):
+def test_engine_message_survives_msgpack(message):
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(message), type=EngineMessage) == message
 
 

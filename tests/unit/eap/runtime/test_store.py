@@ -309,7 +309,7 @@ def stored(stations) -> Stored:
     )
 
 
-def test_round_trip(stored):
+def test_stored_value_survives_its_file(stored):
     assert kept("left").decode(kept("left").encode(stored)) == stored
 
 

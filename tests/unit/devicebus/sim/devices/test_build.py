@@ -42,7 +42,7 @@ def test_profile_of_a_drive():
     assert (device_type(spec("drive")), device_type(spec("digital"))) == (0x20192, 5001)
 
 
-def test_behaviour():
+def test_build_slave_gives_each_kind_its_behaviour():
     assert isinstance(build_slave(spec("drive")).device.behaviour, Axes)
     assert build_slave(spec("digital")).device.behaviour is None
     noisy = spec("analogue", inputs=(ChannelSpec(name="a", type="INT", noise=1),))

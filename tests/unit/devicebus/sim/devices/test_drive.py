@@ -36,7 +36,7 @@ from eap.od.model import OdState
         (0x010F, DriveCommand.ENABLE),
     ],
 )  # fmt: skip
-def test_control_word(word, command):
+def test_control_word_is_a_command(word, command):
     assert command_of(word) is command
 
 
@@ -249,7 +249,7 @@ def test_operation_mode_has_four_octets(idns):
     assert read(idns, "S-0-0032") == b"\1\0\0\0"
 
 
-def test_lists(idns):
+def test_drive_lists_its_idns(idns):
     assert read(idns, "S-0-0016") == bytes.fromhex("0400 2000 8700 3300")
     assert read(idns, "S-0-0024") == bytes.fromhex("0400 2000 8600 2f00")
     assert read(idns, "S-0-0030").endswith(b"1.2")

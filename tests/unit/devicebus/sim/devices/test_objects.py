@@ -112,7 +112,7 @@ def test_assignment_is_changed_from_empty(dictionary):
         ([(0, 9, 1)], AbortCode.TOO_HIGH),
     ],
 )
-def test_refused_changes(dictionary, steps, code):
+def test_object_refuses_change_with_its_abort_code(dictionary, steps, code):
     *well, last = steps
     for step in well:
         write(dictionary, *step)

@@ -80,7 +80,7 @@ def test_pdos_that_are_not_assigned_come_last():
     assert read.string(read.tx_pdos[0].header.name) == "Inputs 2"
 
 
-def test_ports():
+def test_sii_image_has_the_ports():
     spec = generic()
     layout = plan_channels(spec.mailbox, 3, 3)
     dictionary = build_dictionary(spec, 5001)

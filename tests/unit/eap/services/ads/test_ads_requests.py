@@ -30,7 +30,7 @@ def sum_read(*places):
     return struct.pack("<4I", IndexGroup.SUM_READ_EX_2, len(places), 4096, len(items)) + items
 
 
-def test_one_operation():
+def test_ads_request_of_one_operation_is_answered():
     got = ask(AmsCommand.READ, struct.pack("<3I", 1, 5, 2))
     assert got == AmsAnswer(OK + b"\2\0\0\0" + b"\5\0")
 

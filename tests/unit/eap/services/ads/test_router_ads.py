@@ -104,7 +104,7 @@ def test_states_are_those_of_the_station(bench):
     assert bench.control(IO, AdsState.CONFIG) == AdsError.SERVICE
 
 
-def test_sum_commands(bench):
+def test_router_answers_sum_commands(bench):
     items = struct.pack("<6I", G.SDO, 0x1000_0000, 4, G.SDO, 0x1234_0000, 4)
     body = struct.pack("<4I", G.SUM_READ, 2, 100, len(items)) + items
     header = AmsHeader(CLIENT, DEVICE, CLIENT, 1, AmsCommand.READ_WRITE)

@@ -57,13 +57,13 @@ def test_trace_that_ends_before_its_target() -> None:
     assert found["hops"][0]["state"] == "down"
 
 
-def test_scan() -> None:
+def test_scan_lists_stations() -> None:
     found = call("scan")
     assert found["via"] == {"station": "island-01", "address": "127.0.1.1"}
     assert [row["name"] for row in found["stations"]] == ["island-01", "far"]
 
 
-def test_any_request() -> None:
+def test_ams_ask_passes_any_request() -> None:
     answer = call("ams_ask", target="island-01", command=4)
     assert answer == {"error": 0, "data": "0000000005000000"}
     assert call("ams_ask", target="7.1.1.1.1.1:1", command=4)["error"] == 7

@@ -144,7 +144,7 @@ def test_audit_line_has_client_operation_and_result(audit: Audit) -> None:
         (ReadWrite(IndexGroup.FOE_OPEN_WRITE, 0, 4, b"a.bin\0"), {"file": "a.bin", "length": 6}),
     ],
 )
-def test_operation_fields(
+def test_audit_has_the_fields_of_an_operation(
     audit: Audit, operation: Operation | AddRoute, said: dict[str, Any]
 ) -> None:
     audit.write("island-01", entry(operation))
@@ -152,7 +152,7 @@ def test_operation_fields(
     assert line | said == line
 
 
-def test_a_refusal(audit: Audit) -> None:
+def test_audit_has_the_reason_of_a_refusal(audit: Audit) -> None:
     denied = Decision(AccessService.WRITE, False, "no rule allows it, and other hosts only read")
     audit.write("island-01", entry(result=0x723, decision=denied))
     (line,) = lines(audit)

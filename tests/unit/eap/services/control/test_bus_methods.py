@@ -108,7 +108,7 @@ def ask(connection, number, **more):
     return connection.call("bus_ask", params)
 
 
-def test_describe():
+def test_bus_describe_reports_the_bus():
     async def scene(stage, connection):
         for more in ({}, {"wait": True}):
             report = await connection.call("bus_describe", WHERE | more)
@@ -118,7 +118,7 @@ def test_describe():
     play(scene)
 
 
-def test_conversation():
+def test_bus_ask_converses_with_a_slave():
     async def scene(stage, connection):
         number = await open_coe(connection)
         answer = await ask(connection, number)
@@ -218,7 +218,7 @@ def test_datagrams_and_states():
     play(scene)
 
 
-def test_faults():
+def test_bus_fault_reaches_the_segment():
     async def scene(stage, connection):
         command = {"kind": "power", "slave": "drive"}
         assert await connection.call("bus_fault", WHERE | {"command": command}) == {"ok": True}

@@ -61,7 +61,7 @@ def call(methods):
     return call
 
 
-def test_list(call):
+def test_od_list_has_all_objects(call):
     rows = call("od_list", target="left")
     assert rows["next"] is None
     assert rows["objects"][0] == {
@@ -91,7 +91,7 @@ def test_long_lists_come_in_parts(call, monkeypatch, method):
     assert rows == whole
 
 
-def test_describe(call):
+def test_od_describe_has_the_entries(call):
     row = call("od_describe", target="left", index=0xD000)
     assert (row["name"], row["code"]) == ("TxPD 0", "RECORD")
     entry = next(each for each in row["entries"] if each["subindex"] == Tx.CYCLE_TIME)
@@ -150,7 +150,7 @@ def test_dump_has_values(call):
     assert values[Tx.PD_ID] == "0700"
 
 
-def test_states(call, device):
+def test_state_is_read_and_requested(call, device):
     assert call("state", target="left") == {"state": "OP", "error": None}
     assert call("request_state", target="left/eap0", state="preop") == {
         "state": "PREOP",
@@ -223,7 +223,7 @@ def test_apply_of_the_own_plant_file_is_noted(call, stations, file, is_own):
     assert stored.applied == (digest_of(spec) if is_own else "")
 
 
-def test_refused_apply(call, stations, device):
+def test_apply_of_another_interface_is_refused(call, stations, device):
     spec = call("export", station="left")["spec"]
     spec["ports"][0]["interface"] = "udp://0.0.0.0"
     refused = call("apply", station="left", spec=spec)
@@ -269,7 +269,7 @@ def test_router_has_a_dictionary_beside_those_of_ports(call):
         ("export", {"station": "x"}, "unknown station 'x'"),
     ],
 )
-def test_unknown_names(call, method, params, message):
+def test_unknown_names_are_refused(call, method, params, message):
     with pytest.raises(ControlError, match=message) as caught:
         call(method, **params)
     assert caught.value.code == ErrorCode.UNKNOWN_NAME
@@ -286,7 +286,7 @@ def test_unknown_names(call, method, params, message):
         ("state", {}),
     ],
 )
-def test_wrong_parameters(call, method, params):
+def test_wrong_parameters_are_refused(call, method, params):
     with pytest.raises(ControlError, match="params: ") as caught:
         call(method, **params)
     assert caught.value.code == ErrorCode.BAD_REQUEST

@@ -77,7 +77,7 @@ def ask(gateways):
     return call
 
 
-def test_gateway_row(ask, gateways) -> None:
+def test_gateway_status_has_clients_and_slaves(ask, gateways) -> None:
     gateways[FIRST].tracker.admit(HERE, b"request", 0)
     gateways[FIRST].statistics.count(1001, MailboxType.COE, [None], 2000)
     first, second = ask("status", station="left")

@@ -77,9 +77,9 @@ def play(scene: Callable[[Bus, FakeEngine], Awaitable[None]]) -> None:
 @pytest.mark.parametrize("size", [0, 1, ROOM, 2 * ROOM + 1, len(CONTENT)])
 def test_files_of_any_size(size: int) -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        desk = Files(bus)
-        await desk.write(CONTENT[:size])
-        assert await desk.read() == CONTENT[:size]
+        files = Files(bus)
+        await files.write(CONTENT[:size])
+        assert await files.read() == CONTENT[:size]
         assert await Files(bus).read() == CONTENT[:size]
 
     play(scene)
@@ -98,16 +98,16 @@ def test_file_error_of_the_slave_reaches_the_client(
     opcode: FoeOpcode, name: bytes, code: FoeErrorCode
 ) -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        desk = Files(bus)
+        files = Files(bus)
         for _ in range(2):  # asking again is another try
-            assert (await desk.handle(opcode, 0, name))[:2] == (ERROR, code)
-            assert not desk.codec.is_running
-        assert await desk.read() == b"first file"
+            assert (await files.handle(opcode, 0, name))[:2] == (ERROR, code)
+            assert not files.codec.is_running
+        assert await files.read() == b"first file"
 
     play(scene)
 
 
-def test_a_password() -> None:
+def test_file_codec_passes_the_password() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         assert await Files(bus).handle(READ, 42, b"locked.bin") == (DATA, 1, b"secret")
 
@@ -116,10 +116,10 @@ def test_a_password() -> None:
 
 def test_a_slave_that_takes_no_more() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        desk = Files(bus)
-        await desk.handle(WRITE, 0, b"small.bin")
+        files = Files(bus)
+        await files.handle(WRITE, 0, b"small.bin")
         for number in range(1, 22):
-            opcode, code, _ = await desk.handle(DATA, number, bytes(ROOM if number < 21 else 1))
+            opcode, code, _ = await files.handle(DATA, number, bytes(ROOM if number < 21 else 1))
             if opcode == ERROR:
                 break
         assert (opcode, code) == (ERROR, FoeErrorCode.DISK_FULL)
@@ -136,45 +136,45 @@ def test_a_slave_that_takes_no_more() -> None:
 )
 def test_a_step_out_of_order(opcode: FoeOpcode, number: int, code: FoeErrorCode) -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        desk = Files(bus)
-        await desk.handle(WRITE, 0, b"a.bin")
-        assert (await desk.handle(opcode, number))[:2] == (ERROR, code)
-        assert await desk.read() == b"first file"
+        files = Files(bus)
+        await files.handle(WRITE, 0, b"a.bin")
+        assert (await files.handle(opcode, number))[:2] == (ERROR, code)
+        assert await files.read() == b"first file"
 
     play(scene)
 
 
 def test_file_codec_reader_that_is_busy_gets_its_packet_again() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        desk = Files(bus)
-        await desk.write(CONTENT[: 3 * ROOM])
-        first = await desk.handle(READ, 0, b"a.bin")
-        assert await desk.once(BUSY, 0) == first
-        second = await desk.handle(ACK, 1)
+        files = Files(bus)
+        await files.write(CONTENT[: 3 * ROOM])
+        first = await files.handle(READ, 0, b"a.bin")
+        assert await files.once(BUSY, 0) == first
+        second = await files.handle(ACK, 1)
         assert second == (DATA, 2, CONTENT[ROOM : 2 * ROOM])
-        assert (await desk.handle(ACK, 1))[:2] == (ERROR, FoeErrorCode.PACKET_NUMBER)
-        assert not desk.codec.is_running
+        assert (await files.handle(ACK, 1))[:2] == (ERROR, FoeErrorCode.PACKET_NUMBER)
+        assert not files.codec.is_running
 
     play(scene)
 
 
 def test_file_codec_ends_a_transfer_with_an_unknown_opcode() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        desk = Files(bus)
-        await desk.handle(READ, 0, b"a.bin")
-        (answer,) = await desk.codec.answer(bytes.fromhex("09 00 00000000"))
+        files = Files(bus)
+        await files.handle(READ, 0, b"a.bin")
+        (answer,) = await files.codec.answer(bytes.fromhex("09 00 00000000"))
         assert answer == encode_message(ERROR, FoeErrorCode.ILLEGAL)
-        assert not desk.codec.is_running
+        assert not files.codec.is_running
 
     play(scene)
 
 
 def test_a_packet_longer_than_the_mailbox() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        desk = Files(bus)
-        await desk.handle(WRITE, 0, b"a.bin")
+        files = Files(bus)
+        await files.handle(WRITE, 0, b"a.bin")
         with pytest.raises(GatewayError) as caught:
-            await desk.handle(DATA, 1, bytes(ROOM + 1))
+            await files.handle(DATA, 1, bytes(ROOM + 1))
         assert caught.value.cause is Cause.TOO_LONG
 
     play(scene)
@@ -185,51 +185,51 @@ def test_file_client_that_has_to_wait_gets_busy(goes_on: bool) -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         engine.held_kind = ExchangeMailbox
         engine.holds = True
-        desk = Files(bus, answer_s=0.1)
+        files = Files(bus, answer_s=0.1)
         for _ in range(2):
-            assert (await desk.once(WRITE, 0, b"a.bin"))[0] == BUSY
+            assert (await files.once(WRITE, 0, b"a.bin"))[0] == BUSY
         if goes_on:
             engine.release()
-            assert (await desk.handle(WRITE, 0, b"a.bin"))[0] == ACK
+            assert (await files.handle(WRITE, 0, b"a.bin"))[0] == ACK
             engine.holds = True
-            assert (await desk.once(DATA, 1, b"written"))[0] == BUSY
+            assert (await files.once(DATA, 1, b"written"))[0] == BUSY
             engine.release()
-            assert (await desk.handle(DATA, 1, b"written"))[0] == ACK
+            assert (await files.handle(DATA, 1, b"written"))[0] == ACK
         else:
-            assert await desk.codec.answer(encode_message(FoeOpcode.ERROR, 0x8000)) == []
+            assert await files.codec.answer(encode_message(FoeOpcode.ERROR, 0x8000)) == []
             engine.release()
-        assert await desk.read() == (b"written" if goes_on else b"first file")
+        assert await files.read() == (b"written" if goes_on else b"first file")
 
     play(scene)
 
 
 @pytest.mark.parametrize("opcode", [READ, WRITE])
 def test_a_station_that_vanishes(opcode: FoeOpcode) -> None:
-    async def go_on(desk: Files) -> None:
+    async def go_on(files: Files) -> None:
         for number in range(1, 1000):
             step = (ACK, number) if opcode == READ else (DATA, number, bytes(ROOM))
             async with asyncio.timeout(0.3):
-                await desk.once(*step)
+                await files.once(*step)
 
     async def scene(bus: Bus, engine: FakeEngine) -> None:
         await Files(bus).write(CONTENT)
-        desk = Files(bus, answer_s=0.1)
-        await desk.handle(opcode, 0, b"a.bin")
+        files = Files(bus, answer_s=0.1)
+        await files.handle(opcode, 0, b"a.bin")
         bus.is_gone = True
         with pytest.raises(RemoteAccessError) as caught:
-            await go_on(desk)
+            await go_on(files)
         assert caught.value.result == AdsError.TIMEOUT
-        desk.codec.reset()
+        files.codec.reset()
 
     play(scene)
 
 
 def test_abandoned_write_leaves_no_file() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        desk = Files(bus)
-        await desk.handle(WRITE, 0, b"a.bin")
-        await desk.handle(DATA, 1, bytes(ROOM))
-        desk.codec.reset()
+        files = Files(bus)
+        await files.handle(WRITE, 0, b"a.bin")
+        await files.handle(DATA, 1, bytes(ROOM))
+        files.codec.reset()
         assert await Files(bus).read() == b"first file"
 
     play(scene)
@@ -237,10 +237,10 @@ def test_abandoned_write_leaves_no_file() -> None:
 
 def test_another_file_ends_the_one_before() -> None:
     async def scene(bus: Bus, engine: FakeEngine) -> None:
-        desk = Files(bus)
-        await desk.write(CONTENT)
-        assert (await desk.handle(READ, 0, b"a.bin"))[0] == DATA
-        assert (await desk.handle(READ, 0, b"small.bin")) == (DATA, 1, b"")
-        assert await desk.read() == CONTENT
+        files = Files(bus)
+        await files.write(CONTENT)
+        assert (await files.handle(READ, 0, b"a.bin"))[0] == DATA
+        assert (await files.handle(READ, 0, b"small.bin")) == (DATA, 1, b"")
+        assert await files.read() == CONTENT
 
     play(scene)

@@ -62,7 +62,7 @@ async def nothing(index: int) -> None:
     """All that the dictionary shows is up to date."""
 
 
-class Desk:
+class GatewayHarness:
     """A gateway and its clients.
 
     Attributes:
@@ -144,41 +144,41 @@ def decoded(frame: bytes) -> tuple[MailboxHeader, bytes]:
 
 
 def play(
-    scene: Callable[[Desk], Awaitable[None]],
+    scene: Callable[[GatewayHarness], Awaitable[None]],
     *rules: AccessRule,
     bus: str = "drive",
     settings: Settings | None = None,
 ) -> None:
     async def run() -> None:
-        desk = Desk(bus, rules, settings or Settings(NET_ID))
+        harness = GatewayHarness(bus, rules, settings or Settings(NET_ID))
         try:
-            await scene(desk)
+            await scene(harness)
         finally:
-            await desk.close()
+            await harness.close()
 
     run_virtual(run())
 
 
 def test_each_protocol_of_a_slave() -> None:
-    async def scene(desk: Desk) -> None:
-        assert await desk.one(COE, 1001, VENDOR) == "00 30 43 18 10 01 5a 0e 00 00"
-        assert await desk.one(SOE, 1001, "01 40 2000") == "02 40 20 00 02 00 00 00"
+    async def scene(harness: GatewayHarness) -> None:
+        assert await harness.one(COE, 1001, VENDOR) == "00 30 43 18 10 01 5a 0e 00 00"
+        assert await harness.one(SOE, 1001, "01 40 2000") == "02 40 20 00 02 00 00 00"
         echo = "64110000 0100 0102"
-        assert bytes.fromhex(await desk.one(VOE, 1001, echo)) == bytes.fromhex(echo)
-        assert (await desk.one(FOE, 1001, "01 00 00000000" + b"firmware.bin".hex())).startswith(
+        assert bytes.fromhex(await harness.one(VOE, 1001, echo)) == bytes.fromhex(echo)
+        assert (await harness.one(FOE, 1001, "01 00 00000000" + b"firmware.bin".hex())).startswith(
             "03 00 01 00 00 00 66 69"
         )
-        assert await desk.handle(FOE, 1001, "04 00 01000000") == []
-        assert (await desk.one(EOE, 1001, "06000000"))[:2] == "07"
+        assert await harness.handle(FOE, 1001, "04 00 01000000") == []
+        assert (await harness.one(EOE, 1001, "06000000"))[:2] == "07"
 
     play(scene)
 
 
 def test_gateway_counts_its_answers() -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         counters = []
         for _ in range(9):
-            ((header, _),) = await desk.handle(COE, 1001, VENDOR)
+            ((header, _),) = await harness.handle(COE, 1001, VENDOR)
             counters.append(header.counter)
         assert counters == [(counters[0] - 1 + step) % 7 + 1 for step in range(9)]
 
@@ -186,11 +186,11 @@ def test_gateway_counts_its_answers() -> None:
 
 
 def test_any_upload_command_and_surplus_octets_are_taken() -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         answer = "00 30 43 18 10 01 5a 0e 00 00"
-        assert await desk.one(COE, 1001, "0020 41 1810 01 00000000") == answer
-        assert await desk.one(COE, 1001, VENDOR + "00" * 8) == answer
-        assert await desk.one(COE, 0x8000 | 1001, VENDOR) == answer
+        assert await harness.one(COE, 1001, "0020 41 1810 01 00000000") == answer
+        assert await harness.one(COE, 1001, VENDOR + "00" * 8) == answer
+        assert await harness.one(COE, 0x8000 | 1001, VENDOR) == answer
 
     play(scene)
 
@@ -207,26 +207,26 @@ def test_any_upload_command_and_surplus_octets_are_taken() -> None:
     ],
 )
 def test_gateway_errors_are_in_the_protocol_of_the_request(kind, address, octets, answer) -> None:
-    async def scene(desk: Desk) -> None:
-        ((header, body),) = await desk.handle(kind, address, octets)
+    async def scene(harness: GatewayHarness) -> None:
+        ((header, body),) = await harness.handle(kind, address, octets)
         assert (header.type, body) == (answer[0], bytes.fromhex(answer[1]))
 
     play(scene, bus="coe")
 
 
 def test_a_slave_without_mailbox() -> None:
-    async def scene(desk: Desk) -> None:
-        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 21 00 00 08"
+    async def scene(harness: GatewayHarness) -> None:
+        assert await harness.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 21 00 00 08"
 
     play(scene, bus="io")
 
 
 def test_a_slave_that_is_silent_is_answered_for_in_time() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.handle(COE, 1001, VENDOR)
-        desk.engine.buses[0].line.fault(kind="mailbox", slave="drive")
-        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 04 05"
-        (row,) = desk.gateway.statistics.report()
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.handle(COE, 1001, VENDOR)
+        harness.engine.buses[0].line.fault(kind="mailbox", slave="drive")
+        assert await harness.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 04 05"
+        (row,) = harness.gateway.statistics.report()
         assert row["errors"] == {"timeout": 1}
         assert (row["requests"], row["replies"], row["address"]) == (2, 1, 1001)
 
@@ -234,42 +234,44 @@ def test_a_slave_that_is_silent_is_answered_for_in_time() -> None:
 
 
 def test_silence_where_it_is_wanted() -> None:
-    async def scene(desk: Desk) -> None:
-        assert await desk.handle(COE, 1009, VENDOR) == []
-        assert await desk.one(COE, 1001, "0020 40 9999 00 00000000")
+    async def scene(harness: GatewayHarness) -> None:
+        assert await harness.handle(COE, 1009, VENDOR) == []
+        assert await harness.one(COE, 1001, "0020 40 9999 00 00000000")
 
     play(scene, settings=Settings(NET_ID, is_silent=True))
 
 
 def test_an_engine_that_is_gone_is_answered_for_too() -> None:
-    async def scene(desk: Desk) -> None:
-        desk.engine.buses[0].is_up = False
-        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 06 06"
+    async def scene(harness: GatewayHarness) -> None:
+        harness.engine.buses[0].is_up = False
+        assert await harness.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 06 06"
 
     play(scene)
 
 
 def test_the_masters_dictionary() -> None:
-    async def scene(desk: Desk) -> None:
-        assert await desk.one(COE, 0, "0020 40 0010 00 00000000") == "00 30 43 00 10 00 00 51 00 00"
-        assert (await desk.one(COE, 0, "0020 40 9999 00 00000000"))[:8] == "00 20 80"
-        name = await desk.one(COE, 0, "0020 40 0810 00 00000000")
+    async def scene(harness: GatewayHarness) -> None:
+        assert (
+            await harness.one(COE, 0, "0020 40 0010 00 00000000") == "00 30 43 00 10 00 00 51 00 00"
+        )
+        assert (await harness.one(COE, 0, "0020 40 9999 00 00000000"))[:8] == "00 20 80"
+        name = await harness.one(COE, 0, "0020 40 0810 00 00000000")
         assert bytes.fromhex(name).endswith(b"m" * 300)
-        assert (await desk.one(COE, 0, "0080 01 00 0000 0100"))[:8] == "00 80 02"
-        ((header, body),) = await desk.handle(SOE, 0, "01 40 2000")
+        assert (await harness.one(COE, 0, "0080 01 00 0000 0100"))[:8] == "00 80 02"
+        ((header, body),) = await harness.handle(SOE, 0, "01 40 2000")
         assert (header.type, body) == (SOE, bytes.fromhex("12 40 2000 0110"))
-        ((header, body),) = await desk.handle(FOE, 0, "01 00 00000000 66")
+        ((header, body),) = await harness.handle(FOE, 0, "01 00 00000000 66")
         assert (header.type, body[:6]) == (FOE, bytes.fromhex("05 00 00800000"))
-        ((header, body),) = await desk.handle(VOE, 0, "64110000 0100")
+        ((header, body),) = await harness.handle(VOE, 0, "64110000 0100")
         assert (header.type, body) == (MailboxType.ERR, bytes.fromhex("0100 0200"))
 
     play(scene)
 
 
 def test_all_slaves_answer_for_themselves() -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         answers = {
-            header.address: body.hex() for header, body in await desk.handle(COE, 0xFFFF, VENDOR)
+            header.address: body.hex() for header, body in await harness.handle(COE, 0xFFFF, VENDOR)
         }
         assert set(answers) == {1001, 1002, 1003}
         assert all(each.startswith("003043181001") for each in answers.values())
@@ -278,12 +280,12 @@ def test_all_slaves_answer_for_themselves() -> None:
 
 
 def test_all_slaves_of_a_bus_that_is_down_are_answered_for() -> None:
-    async def scene(desk: Desk) -> None:
-        desk.engine.buses[0].is_up = False
-        desk.engine.say_hello()
-        ((header, body),) = await desk.handle(COE, 0xFFFF, VENDOR)
+    async def scene(harness: GatewayHarness) -> None:
+        harness.engine.buses[0].is_up = False
+        harness.engine.say_hello()
+        ((header, body),) = await harness.handle(COE, 0xFFFF, VENDOR)
         assert (header.address, body[-4:]) == (0xFFFF, bytes.fromhex("00000206"))
-        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 06 06"
+        assert await harness.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 00 00 06 06"
 
     play(scene, bus="coe")
 
@@ -291,17 +293,17 @@ def test_all_slaves_of_a_bus_that_is_down_are_answered_for() -> None:
 def test_changed_addresses_and_settings_are_for_the_next_requests() -> None:
     other = RemoteAddress(ELSEWHERE_BUS, 1004)
 
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         upload = "0020 40 0180 00 00000000"
-        assert (await desk.one(COE, 1003, upload)).startswith("00 30 41")
-        await desk.one(COE, 0x9001, VENDOR)
-        settings = desk.gateway.settings._replace(is_silent=True, limits=ClientLimits(rate=1))
+        assert (await harness.one(COE, 1003, upload)).startswith("00 30 41")
+        await harness.one(COE, 0x9001, VENDOR)
+        settings = harness.gateway.settings._replace(is_silent=True, limits=ClientLimits(rate=1))
         addresses = AddressMap({0x9000: SlaveAddress(1001), 0x9001: other})
-        desk.gateway.change(settings, addresses)
-        await desk.one(COE, 0x9001, VENDOR)  # the first of this second
-        assert desk.asked == [RemoteAddress(ELSEWHERE_BUS, 1003), other]
-        assert len(desk.gateway.transfers()) == 1  # that with 1003, which is what it was
-        assert await desk.handle(COE, 1009, VENDOR) == []  # an error of its own, and too fast
+        harness.gateway.change(settings, addresses)
+        await harness.one(COE, 0x9001, VENDOR)  # the first of this second
+        assert harness.asked == [RemoteAddress(ELSEWHERE_BUS, 1003), other]
+        assert len(harness.gateway.transfers()) == 1  # that with 1003, which is what it was
+        assert await harness.handle(COE, 1009, VENDOR) == []  # an error of its own, and too fast
 
     play(scene, bus="coe")
 
@@ -309,84 +311,84 @@ def test_changed_addresses_and_settings_are_for_the_next_requests() -> None:
 def test_session_restarts_when_the_mailbox_of_a_slave_changes() -> None:
     upload = "0020 40 0180 00 00000000"
 
-    async def scene(desk: Desk) -> None:
-        assert (await desk.one(COE, 1003, upload)).startswith("00 30 41")
-        view = desk.bus.view
+    async def scene(harness: GatewayHarness) -> None:
+        assert (await harness.one(COE, 1003, upload)).startswith("00 30 41")
+        view = harness.bus.view
         slaves = dict(view.latest.slaves)
         slaves[1003] = replace(slaves[1003], to_slave=64, to_master=64)
         view.latest = view.latest._replace(slaves=slaves)
-        answer = bytes.fromhex(await desk.one(COE, 1003, upload))
+        answer = bytes.fromhex(await harness.one(COE, 1003, upload))
         assert len(answer) == 64 - 6
-        assert len(desk.gateway.transfers()) == 1
+        assert len(harness.gateway.transfers()) == 1
 
     play(scene, bus="coe")
 
 
 def test_virtual_addresses_of_local_and_remote_slaves() -> None:
-    async def scene(desk: Desk) -> None:
-        assert await desk.one(COE, 0x9000, VENDOR) == "00 30 43 18 10 01 5a 0e 00 00"
-        assert await desk.one(COE, 0x9001, VENDOR) == "00 30 43 18 10 01 07 00 00 00"
-        assert desk.asked == [RemoteAddress(ELSEWHERE_BUS, 1003)]
-        (operation,) = desk.station.asked
+    async def scene(harness: GatewayHarness) -> None:
+        assert await harness.one(COE, 0x9000, VENDOR) == "00 30 43 18 10 01 5a 0e 00 00"
+        assert await harness.one(COE, 0x9001, VENDOR) == "00 30 43 18 10 01 07 00 00 00"
+        assert harness.asked == [RemoteAddress(ELSEWHERE_BUS, 1003)]
+        (operation,) = harness.station.asked
         assert operation == Read(IndexGroup.SDO, 0x1018_0001, LONGEST_ANSWER)
 
     rule = AccessRule("no", targets=(AccessTarget(str(ELSEWHERE_BUS), 1003),), allow=False)
     play(scene)
 
-    async def refused(desk: Desk) -> None:
-        assert await desk.one(COE, 0x9001, VENDOR) == "00 20 80 18 10 01 00 00 01 06"
-        assert not desk.asked
+    async def refused(harness: GatewayHarness) -> None:
+        assert await harness.one(COE, 0x9001, VENDOR) == "00 20 80 18 10 01 00 00 01 06"
+        assert not harness.asked
 
     play(refused, rule)
 
 
 def test_errors_are_counted_for_their_client() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.handle(COE, 1009, VENDOR)
-        await desk.one(COE, 1001, VENDOR)
-        counts = desk.gateway.tracker.counts_of(HERE)
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.handle(COE, 1009, VENDOR)
+        await harness.one(COE, 1001, VENDOR)
+        counts = harness.gateway.tracker.counts_of(HERE)
         assert (counts.requests, counts.errors) == (2, 1)
 
     play(scene)
 
 
 def test_a_mailbox_error_is_no_request() -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         frame = encode_frame(MailboxHeader(0, 1001, counter=1), bytes.fromhex("0100 0200"))
-        ((header, body),) = [decoded(each) for each in await desk.ask_frame(frame)]
+        ((header, body),) = [decoded(each) for each in await harness.ask_frame(frame)]
         assert (header.type, body) == (MailboxType.ERR, bytes.fromhex("0100 0400"))
 
     play(scene)
 
 
 def test_client_that_only_reads_settings_hears_no_frames() -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         heard: list[bytes] = []
         frame = encode_frame(MailboxHeader(0, 1001, type=EOE), bytes.fromhex("06000000"))
-        task = desk.gateway.receive(frame, HERE, heard.append)
+        task = harness.gateway.receive(frame, HERE, heard.append)
         assert task is not None
         await task
-        desk.engine.tell(UnsolicitedMessage(0, Unsolicited(1001, EOE, b"an Ethernet frame")))
-        await desk.handle(COE, 1001, VENDOR)
+        harness.engine.tell(UnsolicitedMessage(0, Unsolicited(1001, EOE, b"an Ethernet frame")))
+        await harness.handle(COE, 1001, VENDOR)
         assert len(heard) == 1  # the answer
 
     play(scene)
 
 
 def test_ethernet_frames_of_a_slave_go_to_its_clients() -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         heard: list[bytes] = []
         frame = encode_frame(
             MailboxHeader(0, 1001, type=EOE), bytes.fromhex("00010000") + bytes(60)
         )
-        task = desk.gateway.receive(frame, HERE, heard.append)
+        task = harness.gateway.receive(frame, HERE, heard.append)
         assert task is not None
         await task
-        desk.engine.tell(UnsolicitedMessage(0, Unsolicited(1001, EOE, b"an Ethernet frame")))
-        desk.engine.tell(UnsolicitedMessage(0, Unsolicited(1001, COE, b"an emergency")))
-        desk.engine.tell(UnsolicitedMessage(0, Unsolicited(1002, EOE, b"of another slave")))
-        desk.engine.tell(UnsolicitedMessage(1, Unsolicited(1001, EOE, b"of another bus")))
-        await desk.handle(COE, 1001, VENDOR)
+        harness.engine.tell(UnsolicitedMessage(0, Unsolicited(1001, EOE, b"an Ethernet frame")))
+        harness.engine.tell(UnsolicitedMessage(0, Unsolicited(1001, COE, b"an emergency")))
+        harness.engine.tell(UnsolicitedMessage(0, Unsolicited(1002, EOE, b"of another slave")))
+        harness.engine.tell(UnsolicitedMessage(1, Unsolicited(1001, EOE, b"of another bus")))
+        await harness.handle(COE, 1001, VENDOR)
         (back,) = heard
         header, body = decode_frame(back)
         assert (header.type, header.address, bytes(body)) == (EOE, 1001, b"an Ethernet frame")
@@ -410,8 +412,8 @@ DIALECT = {
 def test_requests_of_the_dialect(name) -> None:
     vector = next(each for each in load("high_nibble_dialect") if each.name.endswith(f"/{name}"))
 
-    async def scene(desk: Desk) -> None:
-        (frame,) = await desk.ask_frame(vector.frame)
+    async def scene(harness: GatewayHarness) -> None:
+        (frame,) = await harness.ask_frame(vector.frame)
         assert frame[7] == vector.frame[7]
         assert frame[4:6] == vector.frame[4:6]
         assert frame[8:].startswith(bytes.fromhex(DIALECT[name]))
@@ -422,8 +424,8 @@ def test_requests_of_the_dialect(name) -> None:
 def test_dialect_of_a_read_only_client() -> None:
     write = next(each for each in load("high_nibble_dialect") if "coe_write" in each.name)
 
-    async def scene(desk: Desk) -> None:
-        (frame,) = await desk.ask_frame(write.frame, ELSEWHERE)
+    async def scene(harness: GatewayHarness) -> None:
+        (frame,) = await harness.ask_frame(write.frame, ELSEWHERE)
         assert frame[8:] == bytes.fromhex("0020 80 4060 00 02000106")
 
     play(scene)

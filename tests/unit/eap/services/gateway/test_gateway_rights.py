@@ -12,7 +12,7 @@ from tests.unit.eap.services.gateway.test_gateway import (
     HERE,
     SOE,
     VENDOR,
-    Desk,
+    GatewayHarness,
     play,
 )
 
@@ -20,13 +20,13 @@ WRITE = "0020 2b 4060 00 06000000"
 
 
 def test_writing_to_all_takes_a_rule() -> None:
-    async def scene(desk: Desk) -> None:
-        for header, body in await desk.handle(COE, 0xFFFF, WRITE):
+    async def scene(harness: GatewayHarness) -> None:
+        for header, body in await harness.handle(COE, 0xFFFF, WRITE):
             assert header.address == 1001
             assert body.hex().startswith("002080406000000001")
 
-    async def allowed(desk: Desk) -> None:
-        ((_, body),) = await desk.handle(COE, 0xFFFF, WRITE)
+    async def allowed(harness: GatewayHarness) -> None:
+        ((_, body),) = await harness.handle(COE, 0xFFFF, WRITE)
         assert body.hex().startswith("0030604060")
 
     play(scene)
@@ -34,17 +34,17 @@ def test_writing_to_all_takes_a_rule() -> None:
 
 
 def test_other_hosts_only_read() -> None:
-    async def scene(desk: Desk) -> None:
-        assert (await desk.one(COE, 1001, VENDOR, ELSEWHERE)).startswith("00 30 43")
+    async def scene(harness: GatewayHarness) -> None:
+        assert (await harness.one(COE, 1001, VENDOR, ELSEWHERE)).startswith("00 30 43")
         write = "0020 2b 4060 00 06000000"
-        assert (await desk.one(COE, 1001, write, ELSEWHERE)).startswith(
+        assert (await harness.one(COE, 1001, write, ELSEWHERE)).startswith(
             "00 20 80 40 60 00 00 00 01 06"
         )
-        assert (await desk.one(FOE, 1001, "02 00 00000000" + FILE, ELSEWHERE)).startswith(
+        assert (await harness.one(FOE, 1001, "02 00 00000000" + FILE, ELSEWHERE)).startswith(
             "05 00 0a 80"
         )
-        assert (await desk.one(SOE, 1001, "03 40 2000 01020304", ELSEWHERE)).startswith("14")
-        assert (await desk.one(COE, 1001, WRITE)).startswith("00 30 60")
+        assert (await harness.one(SOE, 1001, "03 40 2000 01020304", ELSEWHERE)).startswith("14")
+        assert (await harness.one(COE, 1001, WRITE)).startswith("00 30 60")
 
     play(scene)
 
@@ -57,25 +57,25 @@ def test_a_rule_opens_one_object() -> None:
         objects=(ObjectRange(0x6040, 0x6040),),
     )
 
-    async def scene(desk: Desk) -> None:
-        assert (await desk.one(COE, 1001, "0020 2b 4060 00 06000000", ELSEWHERE)).startswith(
+    async def scene(harness: GatewayHarness) -> None:
+        assert (await harness.one(COE, 1001, "0020 2b 4060 00 06000000", ELSEWHERE)).startswith(
             "00 30 60"
         )
         other = "0020 23 0080 01 06000000"
-        assert (await desk.one(COE, 1001, other, ELSEWHERE)).startswith("00 20 80")
+        assert (await harness.one(COE, 1001, other, ELSEWHERE)).startswith("00 20 80")
 
     play(scene, rule)
 
 
 def test_changes_and_refusals_are_audited() -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         entries: list[AuditEntry] = []
-        desk.gateway.admission.on_audit.append(entries.append)
-        await desk.one(COE, 1001, VENDOR, ELSEWHERE)
+        harness.gateway.admission.on_audit.append(entries.append)
+        await harness.one(COE, 1001, VENDOR, ELSEWHERE)
         assert not entries
-        await desk.one(COE, 1001, WRITE, ELSEWHERE)
-        await desk.one(COE, 1001, WRITE)
-        await desk.handle(COE, 0xFFFF, WRITE)
+        await harness.one(COE, 1001, WRITE, ELSEWHERE)
+        await harness.one(COE, 1001, WRITE)
+        await harness.handle(COE, 0xFFFF, WRITE)
         told = [
             (each.endpoint, each.header.target_port, each.operations[0].result) for each in entries
         ]
@@ -88,26 +88,26 @@ def test_changes_and_refusals_are_audited() -> None:
 
 
 def test_access_to_a_remote_file_is_decided_at_its_opening() -> None:
-    async def scene(desk: Desk) -> None:
-        refused = await desk.one(FOE, 0x9001, "02 00 00000000" + FILE, ELSEWHERE)
+    async def scene(harness: GatewayHarness) -> None:
+        refused = await harness.one(FOE, 0x9001, "02 00 00000000" + FILE, ELSEWHERE)
         assert refused.startswith("05 00 0a 80 00 00")
-        step = await desk.one(FOE, 0x9001, "03 00 01000000 61", ELSEWHERE)
+        step = await harness.one(FOE, 0x9001, "03 00 01000000 61", ELSEWHERE)
         assert step.startswith("05 00 04 80 00 00")
-        assert not desk.station.asked
-        await desk.one(FOE, 0x9001, "01 00 00000000" + FILE, ELSEWHERE)
-        assert desk.station.asked, "reading takes no rule"
+        assert not harness.station.asked
+        await harness.one(FOE, 0x9001, "01 00 00000000" + FILE, ELSEWHERE)
+        assert harness.station.asked, "reading takes no rule"
 
     play(scene)
 
 
 def test_audit_has_the_result_of_a_change() -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         entries: list[AuditEntry] = []
-        desk.gateway.admission.on_audit.append(entries.append)
-        await desk.one(COE, 1001, "0020 2b 5555 00 06000000")
-        await desk.handle(COE, 1009, WRITE)
-        await desk.ask_frame(bytes.fromhex("0e50 0800 e903 0030 0020 20 4060 00 0600"))
-        await desk.ask_frame(bytes.fromhex("0e50 0800 e903 0030 0020 20 5555 00 0600"))
+        harness.gateway.admission.on_audit.append(entries.append)
+        await harness.one(COE, 1001, "0020 2b 5555 00 06000000")
+        await harness.handle(COE, 1009, WRITE)
+        await harness.ask_frame(bytes.fromhex("0e50 0800 e903 0030 0020 20 4060 00 0600"))
+        await harness.ask_frame(bytes.fromhex("0e50 0800 e903 0030 0020 20 5555 00 0600"))
         operations = [each.operations[0] for each in entries]
         assert [each.result for each in operations] == [0x70C, 6, 0, 0x700]
         assert [each.operation.data for each in operations[:2]] == [b"\6\0", b"\6\0"]

@@ -22,7 +22,7 @@ from tests.unit.eap.services.gateway.test_gateway import (
     HERE,
     NET_ID,
     VENDOR,
-    Desk,
+    GatewayHarness,
     decoded,
     play,
 )
@@ -33,36 +33,36 @@ def test_repeated_request_on_a_connection_is_answered_twice() -> None:
         MailboxHeader(0, 1001, type=COE, counter=3), bytes.fromhex("0020 40 1810 01 00000000")
     )
 
-    async def answers(desk: Desk, endpoint: Endpoint) -> int:
+    async def answers(harness: GatewayHarness, endpoint: Endpoint) -> int:
         return sum(
-            map(len, await asyncio.gather(*(desk.ask_frame(request, endpoint) for _ in "123")))
+            map(len, await asyncio.gather(*(harness.ask_frame(request, endpoint) for _ in "123")))
         )
 
-    async def scene(desk: Desk) -> None:
-        assert await answers(desk, HERE) == 1
-        assert await answers(desk, Endpoint("tcp:eap0", "127.0.0.1:1")) == 3
+    async def scene(harness: GatewayHarness) -> None:
+        assert await answers(harness, HERE) == 1
+        assert await answers(harness, Endpoint("tcp:eap0", "127.0.0.1:1")) == 3
 
     play(scene)
 
 
 def test_a_repeated_step_of_a_transfer_is_answered_and_counted() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.one(FOE, 1001, "02 00 00000000" + FILE)
         packet = "03 00 01000000" + "61" * 1012
-        first = await desk.one(FOE, 1001, packet)
-        assert await desk.one(FOE, 1001, packet) == first
-        counts = desk.gateway.tracker.counts_of(HERE)
+        first = await harness.one(FOE, 1001, packet)
+        assert await harness.one(FOE, 1001, packet) == first
+        counts = harness.gateway.tracker.counts_of(HERE)
         assert (counts.requests, counts.repeated) == (3, 1)
-        await desk.one(FOE, 1001, "03 00 02000000")
+        await harness.one(FOE, 1001, "03 00 02000000")
 
     play(scene)
 
 
 def test_client_over_its_rate_gets_an_error() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(COE, 1001, VENDOR)
-        assert await desk.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 21 00 00 08"
-        assert desk.gateway.statistics.report()[0]["errors"] == {"too_fast": 1}
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.one(COE, 1001, VENDOR)
+        assert await harness.one(COE, 1001, VENDOR) == "00 20 80 18 10 01 21 00 00 08"
+        assert harness.gateway.statistics.report()[0]["errors"] == {"too_fast": 1}
 
     play(scene, settings=Settings(NET_ID, limits=ClientLimits(rate=1)))
 
@@ -70,116 +70,116 @@ def test_client_over_its_rate_gets_an_error() -> None:
 def test_two_clients_transfers_do_not_mix() -> None:
     first, second = b"a" * 3000, b"b" * 2500
 
-    async def write(desk: Desk, name: bytes, data: bytes, endpoint: Endpoint) -> None:
+    async def write(harness: GatewayHarness, name: bytes, data: bytes, endpoint: Endpoint) -> None:
         body = bytes.fromhex("02 00 00000000") + name
-        while (await desk.one(FOE, 1001, body, endpoint))[:2] == "06":
+        while (await harness.one(FOE, 1001, body, endpoint))[:2] == "06":
             pass
         room = 1024 - 12
         for number, at in enumerate(range(0, len(data) + 1, room), 1):
             packet = bytes((3, 0)) + number.to_bytes(4, "little") + data[at : at + room]
-            answer = await desk.one(FOE, 1001, packet, endpoint)
+            answer = await harness.one(FOE, 1001, packet, endpoint)
             assert answer == (bytes((4, 0)) + number.to_bytes(4, "little")).hex(" ")
 
-    async def read(desk: Desk, name: bytes) -> bytes:
+    async def read(harness: GatewayHarness, name: bytes) -> bytes:
         content = b""
         body = bytes.fromhex("01 00 00000000") + name
         while True:
-            ((_, packet),) = await desk.handle(FOE, 1001, body)
+            ((_, packet),) = await harness.handle(FOE, 1001, body)
             content += packet[6:]
             body = bytes((4, 0)) + packet[2:6]
             if len(packet) < 1024 - 6:
-                await desk.handle(FOE, 1001, body)
+                await harness.handle(FOE, 1001, body)
                 return content
 
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         await asyncio.gather(
-            write(desk, b"firmware.bin", first, HERE),
-            write(desk, b"parameters.bin", second, ALSO_HERE),
+            write(harness, b"firmware.bin", first, HERE),
+            write(harness, b"parameters.bin", second, ALSO_HERE),
         )
-        assert await read(desk, b"firmware.bin") == first
-        assert await read(desk, b"parameters.bin") == second
+        assert await read(harness, b"firmware.bin") == first
+        assert await read(harness, b"parameters.bin") == second
 
     play(scene, settings=Settings(NET_ID, answer_s=0.2))
 
 
 def test_client_that_waits_too_long_gets_busy() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
-        answer = await desk.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.one(FOE, 1001, "02 00 00000000" + FILE)
+        answer = await harness.one(FOE, 1001, "01 00 00000000" + FILE, ALSO_HERE)
         assert answer.startswith("06 00 00 00 64 00")
-        await desk.handle(FOE, 1001, "05 00 00800000")
-        assert (await desk.begin_file("01 00 00000000" + FILE, ALSO_HERE)).startswith("03")
+        await harness.handle(FOE, 1001, "05 00 00800000")
+        assert (await harness.begin_file("01 00 00000000" + FILE, ALSO_HERE)).startswith("03")
 
     play(scene, settings=Settings(NET_ID, answer_s=0.2))
 
 
 def test_a_step_that_comes_twice_gets_the_same_answer_and_goes_no_further() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.one(FOE, 1001, "02 00 00000000" + FILE)
         packet = bytes.fromhex("03 00 01000000") + bytes(1024 - 12)
-        answers = [await desk.one(FOE, 1001, packet) for _ in range(2)]
+        answers = [await harness.one(FOE, 1001, packet) for _ in range(2)]
         assert answers == ["04 00 01 00 00 00"] * 2
-        assert (await desk.one(FOE, 1001, "03 00 02000000 01")) == "04 00 02 00 00 00"
-        assert (await desk.one(FOE, 1001, "03 00 02000000 01")) == "04 00 02 00 00 00"
+        assert (await harness.one(FOE, 1001, "03 00 02000000 01")) == "04 00 02 00 00 00"
+        assert (await harness.one(FOE, 1001, "03 00 02000000 01")) == "04 00 02 00 00 00"
 
     play(scene)
 
 
 def test_a_step_of_no_transfer_does_not_reach_the_slave() -> None:
-    async def scene(desk: Desk) -> None:
-        assert (await desk.one(FOE, 1001, "03 00 01000000 01"))[:2] == "05"
-        answer = await desk.one(COE, 1001, "0020 60 00000000000000")
+    async def scene(harness: GatewayHarness) -> None:
+        assert (await harness.one(FOE, 1001, "03 00 01000000 01"))[:2] == "05"
+        answer = await harness.one(COE, 1001, "0020 60 00000000000000")
         assert answer.startswith("00 20 80")
 
     play(scene)
 
 
 def test_a_client_that_leaves_leaves_no_transfer_behind() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(FOE, 1001, "02 00 00000000" + FILE)
-        desk.gateway.connection_closed(HERE)
-        assert (await desk.begin_file("01 00 00000000" + FILE, ALSO_HERE)).startswith("03")
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.one(FOE, 1001, "02 00 00000000" + FILE)
+        harness.gateway.connection_closed(HERE)
+        assert (await harness.begin_file("01 00 00000000" + FILE, ALSO_HERE)).startswith("03")
 
     play(scene)
 
 
 def test_stopped_gateway_aborts_all_transfers() -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(FOE, 1001, "01 00 00000000" + FILE)
-        (running,) = desk.gateway.transfers()
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.one(FOE, 1001, "01 00 00000000" + FILE)
+        (running,) = harness.gateway.transfers()
         assert (running.endpoint, running.address, running.kind) == (HERE, 1001, FOE)
-        await desk.gateway.stop()
-        assert not desk.gateway.is_open
-        assert not desk.gateway.transfers()
-        assert not desk.gateway.tracker.table()
-        desk.gateway.start()
-        assert desk.gateway.is_open
-        assert (await desk.one(FOE, 1001, "01 00 00000000" + FILE)).startswith("03")
+        await harness.gateway.stop()
+        assert not harness.gateway.is_open
+        assert not harness.gateway.transfers()
+        assert not harness.gateway.tracker.table()
+        harness.gateway.start()
+        assert harness.gateway.is_open
+        assert (await harness.one(FOE, 1001, "01 00 00000000" + FILE)).startswith("03")
 
     play(scene)
 
 
 def test_the_same_request_is_answered_once_until_then() -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         frame = encode_frame(MailboxHeader(0, 1001, type=COE, counter=1), bytes.fromhex(VENDOR))
         answers: list[bytes] = []
         for _ in range(3):
-            desk.gateway.receive(frame, HERE, answers.append)
-        await desk.gateway.wait_below(HERE, 1)
+            harness.gateway.receive(frame, HERE, answers.append)
+        await harness.gateway.wait_below(HERE, 1)
         assert len(answers) == 1
-        assert len(await desk.ask_frame(frame)) == 1
+        assert len(await harness.ask_frame(frame)) == 1
 
     play(scene)
 
 
 def test_client_over_its_pending_limit_gets_an_error() -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         answers: list[bytes] = []
         for index in range(4):
             body = b"\0\x20\x40" + bytes((index, 0x60)) + bytes(5)
-            desk.gateway.receive(encode_plain_frame(COE, 1001, 0, body), HERE, answers.append)
+            harness.gateway.receive(encode_plain_frame(COE, 1001, 0, body), HERE, answers.append)
         assert [decoded(each)[1][-4:].hex() for each in answers] == ["05000405"] * 2
-        await desk.gateway.wait_below(HERE, 1)
+        await harness.gateway.wait_below(HERE, 1)
         assert len(answers) == 4
 
     play(scene, settings=Settings(NET_ID, limits=ClientLimits(in_flight=2)))
@@ -187,18 +187,18 @@ def test_client_over_its_pending_limit_gets_an_error() -> None:
 
 @pytest.mark.parametrize("address", [0, 1001])
 def test_the_same_octets_right_behind_the_answer_are_a_new_request(address: int) -> None:
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         answers: list[bytes] = []
         frame = encode_plain_frame(COE, address, 3, bytes.fromhex(VENDOR))
 
         def ask_again(octets: bytes) -> None:
             answers.append(octets)
             if len(answers) < 6:
-                desk.gateway.receive(frame, HERE, ask_again)
+                harness.gateway.receive(frame, HERE, ask_again)
 
-        desk.gateway.receive(frame, HERE, ask_again)
-        await desk.gateway.wait_below(HERE, 1)
+        harness.gateway.receive(frame, HERE, ask_again)
+        await harness.gateway.wait_below(HERE, 1)
         assert len(answers) == 6
-        assert desk.gateway.tracker.waiting(HERE) == 0
+        assert harness.gateway.tracker.waiting(HERE) == 0
 
     play(scene)

@@ -40,7 +40,7 @@ def test_segments_of_two_clients_do_not_meet() -> None:
     assert segment.body[2] == 0x80
 
 
-def test_refusals() -> None:
+def test_master_session_refuses_other_protocols() -> None:
     (reply,) = run_virtual(session().handle(MailboxType.FOE, b"\1\0\0\0\0\0f"))
     assert (reply.type, reply.reason) == (MailboxType.FOE, Cause.NO_PROTOCOL)
     assert reply.body[:6] == bytes.fromhex("0500 00800000")

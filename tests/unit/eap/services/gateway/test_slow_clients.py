@@ -17,7 +17,7 @@ from tests.unit.eap.services.gateway.test_gateway import (
     HERE,
     NET_ID,
     VENDOR,
-    Desk,
+    GatewayHarness,
     play,
 )
 
@@ -28,17 +28,17 @@ SETTINGS = Settings(NET_ID, answer_s=1.0)
 """A slave that another client holds is reported, also on a busy machine."""
 
 
-async def read_identity(desk: Desk, count: int) -> list[str]:
+async def read_identity(harness: GatewayHarness, count: int) -> list[str]:
     """Return the answers to reads of another client."""
-    return [await desk.one(COE, SENSOR, VENDOR, ALSO_HERE) for _ in range(count)]
+    return [await harness.one(COE, SENSOR, VENDOR, ALSO_HERE) for _ in range(count)]
 
 
-async def fetch_segments(desk: Desk, toggle: int, count: int) -> bytes:
+async def fetch_segments(harness: GatewayHarness, toggle: int, count: int) -> bytes:
     """Return the data of the next segments of an upload."""
     content = b""
     for _ in range(count):
         answer = bytes.fromhex(
-            await desk.one(COE, SENSOR, bytes((0, 0x20, 0x60 | toggle << 4)) + bytes(7))
+            await harness.one(COE, SENSOR, bytes((0, 0x20, 0x60 | toggle << 4)) + bytes(7))
         )
         command, data = answer[2], answer[3:]
         content += data[: len(data) - (command >> 1 & 7 if len(data) == SEGMENT_MINIMUM else 0)]
@@ -49,14 +49,14 @@ async def fetch_segments(desk: Desk, toggle: int, count: int) -> bytes:
 
 
 def test_upload_fetched_slowly_leaves_the_slave_to_other_clients() -> None:
-    async def scene(desk: Desk) -> None:
-        first = await desk.one(COE, SENSOR, f"0020 40 {CALIBRATION} 00000000")
+    async def scene(harness: GatewayHarness) -> None:
+        first = await harness.one(COE, SENSOR, f"0020 40 {CALIBRATION} 00000000")
         assert first.startswith("00 30 41 01 80 00 00 08 00 00")
-        assert await read_identity(desk, 7) == [IDENTITY] * 7
-        content = bytes.fromhex(first)[DATA:] + await fetch_segments(desk, 0, 1)
-        assert await read_identity(desk, 7) == [IDENTITY] * 7
-        content += await fetch_segments(desk, 1, SIZE)
-        assert await read_identity(desk, 7) == [IDENTITY] * 7
+        assert await read_identity(harness, 7) == [IDENTITY] * 7
+        content = bytes.fromhex(first)[DATA:] + await fetch_segments(harness, 0, 1)
+        assert await read_identity(harness, 7) == [IDENTITY] * 7
+        content += await fetch_segments(harness, 1, SIZE)
+        assert await read_identity(harness, 7) == [IDENTITY] * 7
         assert content == bytes(SIZE)
 
     play(scene, bus="coe", settings=SETTINGS)
@@ -66,17 +66,17 @@ def test_download_brought_slowly_leaves_the_slave_to_other_clients() -> None:
     data = bytes(range(256)) * (SIZE // 256)
     first, step = 128 - 16, 128 - 9
 
-    async def scene(desk: Desk) -> None:
+    async def scene(harness: GatewayHarness) -> None:
         begin = bytes.fromhex(f"0020 21 {CALIBRATION}") + SIZE.to_bytes(4, "little")
-        assert (await desk.one(COE, SENSOR, begin + data[:first])).startswith("00 30 60")
+        assert (await harness.one(COE, SENSOR, begin + data[:first])).startswith("00 30 60")
         for number, at in enumerate(range(first, SIZE, step)):
-            assert await read_identity(desk, 2) == [IDENTITY] * 2
+            assert await read_identity(harness, 2) == [IDENTITY] * 2
             toggle, is_last = number % 2, at + step >= SIZE
             command = bytes((0, 0x20, toggle << 4 | is_last))
-            answer = await desk.one(COE, SENSOR, command + data[at : at + step])
+            answer = await harness.one(COE, SENSOR, command + data[at : at + step])
             assert answer.startswith("00 30 30" if toggle else "00 30 20")
-        found = bytes.fromhex(await desk.one(COE, SENSOR, f"0020 40 {CALIBRATION} 00000000"))
-        assert found[DATA:] + await fetch_segments(desk, 0, SIZE) == data
+        found = bytes.fromhex(await harness.one(COE, SENSOR, f"0020 40 {CALIBRATION} 00000000"))
+        assert found[DATA:] + await fetch_segments(harness, 0, SIZE) == data
 
     play(scene, bus="coe", settings=SETTINGS)
 
@@ -84,14 +84,14 @@ def test_download_brought_slowly_leaves_the_slave_to_other_clients() -> None:
 def test_file_read_slowly_leaves_the_slave_to_other_clients() -> None:
     content = bytes(range(251)) * 20
 
-    async def scene(desk: Desk) -> None:
-        await desk.write_file(FILE, content)
-        first = await desk.begin_file("01 00 00000000" + FILE)
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.write_file(FILE, content)
+        first = await harness.begin_file("01 00 00000000" + FILE)
         for _ in range(3):
-            other = await desk.begin_file("01 00 00000000" + FILE, ALSO_HERE)
+            other = await harness.begin_file("01 00 00000000" + FILE, ALSO_HERE)
             assert other == first
-            assert await desk.handle(FOE, 1001, "05 00 00800000", ALSO_HERE) == []
-        second = await desk.one(FOE, 1001, "04 00 01000000")
+            assert await harness.handle(FOE, 1001, "05 00 00800000", ALSO_HERE) == []
+        second = await harness.one(FOE, 1001, "04 00 01000000")
         assert bytes.fromhex(first)[6:] + bytes.fromhex(second)[6:] == content[: 2 * 1012]
 
     play(scene, settings=SETTINGS)
@@ -100,15 +100,15 @@ def test_file_read_slowly_leaves_the_slave_to_other_clients() -> None:
 def test_file_left_in_the_middle_gives_way_to_another_client(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    async def scene(desk: Desk) -> None:
-        assert await desk.begin_file("02 00 00000000" + FILE) == "04 00 00 00 00 00"
+    async def scene(harness: GatewayHarness) -> None:
+        assert await harness.begin_file("02 00 00000000" + FILE) == "04 00 00 00 00 00"
         begin = "01 00 00000000" + FILE
-        assert (await desk.one(FOE, 1001, begin, ALSO_HERE)).startswith("06")
-        (held, waiting) = desk.gateway.transfers()
+        assert (await harness.one(FOE, 1001, begin, ALSO_HERE)).startswith("06")
+        (held, waiting) = harness.gateway.transfers()
         assert (held.endpoint, waiting.endpoint) == (HERE, ALSO_HERE)
         monkeypatch.setattr(gateway, "STALL_S", 0.0)
-        assert (await desk.begin_file(begin, ALSO_HERE)).startswith("03 00 01 00 00 00")
-        late = await desk.one(FOE, 1001, "03 00 01000000 61")
+        assert (await harness.begin_file(begin, ALSO_HERE)).startswith("03 00 01 00 00 00")
+        late = await harness.one(FOE, 1001, "03 00 01000000 61")
         assert bytes.fromhex(late)[6:] == b"no active transfer\0"
 
     play(scene, settings=SETTINGS)
@@ -118,11 +118,11 @@ def test_file_that_is_fetched_ahead_does_not_give_way(monkeypatch: pytest.Monkey
     monkeypatch.setattr(gateway, "STALL_S", 0.0)
     content = bytes(range(251)) * 20
 
-    async def scene(desk: Desk) -> None:
-        await desk.write_file(FILE, content)
-        await desk.begin_file("01 00 00000000" + FILE)
-        await desk.write_file(b"parameters.bin".hex(), content, ALSO_HERE)
-        second = await desk.one(FOE, 1001, "04 00 01000000")
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.write_file(FILE, content)
+        await harness.begin_file("01 00 00000000" + FILE)
+        await harness.write_file(b"parameters.bin".hex(), content, ALSO_HERE)
+        second = await harness.one(FOE, 1001, "04 00 01000000")
         assert bytes.fromhex(second)[6:] == content[1012 : 2 * 1012]
 
     play(scene, settings=SETTINGS)
@@ -139,13 +139,13 @@ def test_file_that_is_fetched_ahead_does_not_give_way(monkeypatch: pytest.Monkey
 def test_client_that_leaves_keeps_nothing(
     bus: str, kind: MailboxType, address: int, begin: str
 ) -> None:
-    async def scene(desk: Desk) -> None:
-        await desk.one(kind, address, begin)
-        assert desk.gateway.transfers()
-        assert desk.gateway.memory.held + desk.gateway.file_memory.held > 0
-        await desk.gateway.stop()
-        assert not desk.gateway.transfers()
-        assert desk.gateway.memory.held == desk.gateway.file_memory.held == 0
+    async def scene(harness: GatewayHarness) -> None:
+        await harness.one(kind, address, begin)
+        assert harness.gateway.transfers()
+        assert harness.gateway.memory.held + harness.gateway.file_memory.held > 0
+        await harness.gateway.stop()
+        assert not harness.gateway.transfers()
+        assert harness.gateway.memory.held == harness.gateway.file_memory.held == 0
 
     play(scene, bus=bus, settings=SETTINGS)
 

@@ -21,7 +21,7 @@ from tests.support.virtualtime import run_virtual
 
 
 @pytest.mark.parametrize("service", [AdsService, StubService])
-def test_services(service):
+def test_services_have_the_methods_of_the_protocol(service):
     for method in ("answer", "client_gone"):
         asked = [*signature(getattr(Service, method)).parameters]
         assert [*signature(getattr(service, method)).parameters] == asked
@@ -30,7 +30,7 @@ def test_services(service):
 @pytest.mark.parametrize(
     "sender", [AmsClients, ChannelSender, RecordingSender, LocalClient, MailboxStreams]
 )
-def test_senders(sender):
+def test_senders_have_the_method_of_the_protocol(sender):
     assert [*signature(sender.send).parameters] == [*signature(TransportSender.send).parameters]
 
 

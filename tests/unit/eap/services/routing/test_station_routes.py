@@ -351,7 +351,7 @@ def test_virtual_net_id_is_the_one_that_is_known_here():
         (HopSpec(TransportKind.MQTT, "line", "1.2.3.4.5.6"), Endpoint("mqtt:line", "1.2.3.4.5.6")),
     ],
 )  # fmt: skip
-def test_hops(hop, endpoint):
+def test_hop_becomes_an_endpoint(hop, endpoint):
     assert to_endpoint(hop) == endpoint
 
 

@@ -367,7 +367,7 @@ RIGHT = AmsAddress(NetId.parse("127.0.9.2.1.1"), 10000)
         ("9.9.9.9.1.1:851", "9.9.9.9.1.1:851"),
     ],
 )
-def test_targets(text: str, address: str) -> None:
+def test_trace_finds_targets_by_name(text: str, address: str) -> None:
     assert str(find_target(Left().router, DIRECTORY, text)) == address
 
 

@@ -52,7 +52,7 @@ def vendor():
     return coe_client.upload(0x1018, 1)
 
 
-def test_describe():
+def test_bus_client_describes_slaves():
     async def scene(client, engine):
         report = await client.describe()
         assert [each.name for each in report.slaves] == ["coupler", "buttons", "sensor"]
@@ -60,7 +60,7 @@ def test_describe():
     play(scene)
 
 
-def test_conversation():
+def test_bus_client_converses_with_slaves():
     async def scene(client, engine):
         assert await client.converse(SENSOR, vendor(), "me") == b"\x5a\x0e\0\0"
         with pytest.raises(SdoAbortError):
@@ -185,7 +185,7 @@ def test_turn_that_was_not_used_is_given_back_without_a_word():
     play(scene, "drive")
 
 
-def test_procedures():
+def test_bus_client_runs_procedures():
     async def scene(client, engine):
         octets = await client.run(read(SENSOR, Register.STATION_ADDRESS, 2))
         assert int.from_bytes(octets, "little") == SENSOR
@@ -205,7 +205,7 @@ def test_procedures():
     play(scene)
 
 
-def test_states():
+def test_bus_client_brings_slaves_to_states():
     async def scene(client, engine):
         await client.bring(0, AlState.INIT)
         await client.bring(SENSOR, AlState.PREOP)

@@ -52,7 +52,7 @@ def test_several_at_once_get_their_own_answers():
     play(scene)
 
 
-def test_silence():
+def test_command_to_silent_segment_fails():
     async def scene(segment, link):
         segment.is_silent = True
         with pytest.raises(BusError, match="does not answer"):

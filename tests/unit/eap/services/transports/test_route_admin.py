@@ -214,7 +214,7 @@ def test_sender_is_audited():
     assert [each.operations[0].decision.is_allowed for each in entries] == [False, True]
 
 
-class Desk:
+class AdminHarness:
     """A route admin with a clock; *ask* returns the results of some requests of one sender."""
 
     def __init__(self) -> None:
@@ -230,7 +230,7 @@ class Desk:
 
 
 def test_route_admin_sender_guesses_passwords_is_limited():
-    route_admin = Desk()
+    route_admin = AdminHarness()
     burst = RATES.source.burst
     assert route_admin.ask("10.0.0.5", burst + 2) == [AdsError.ACCESS] * burst + [None] * 2
     route_admin.now = 2.0
@@ -238,14 +238,14 @@ def test_route_admin_sender_guesses_passwords_is_limited():
 
 
 def test_route_admin_flood_of_one_sender_others_are_answered():
-    route_admin = Desk()
+    route_admin = AdminHarness()
     route_admin.ask("10.0.0.5", 10 * RATES.source.burst)
     assert route_admin.ask("10.0.0.6") == [AdsError.ACCESS]
     assert route_admin.ask("127.0.0.1", is_this_host=True) == [AdsError.NONE]
 
 
 def test_route_admin_flood_of_many_senders_known_ones_and_this_host_are_answered():
-    route_admin = Desk()
+    route_admin = AdminHarness()
     assert route_admin.ask("10.0.0.5") == [AdsError.ACCESS]
     answers = [route_admin.ask(f"10.1.{number // 250}.{number % 250}") for number in range(5000)]
     assert answers.count([AdsError.ACCESS]) == RATES.new.burst - 1
@@ -254,7 +254,7 @@ def test_route_admin_flood_of_many_senders_known_ones_and_this_host_are_answered
 
 
 def test_route_admin_known_senders_are_limited_together_and_new_ones_are_answered():
-    route_admin = Desk()
+    route_admin = AdminHarness()
     senders = [f"10.0.0.{number}" for number in range(1, 30)]
     for sender in senders:
         route_admin.ask(sender)
