@@ -105,12 +105,10 @@ static PyObject *waiter_wait(Waiter *self, PyObject *args) {
     int polls = 0;
     if (!PyArg_ParseTuple(args, "L|p", &deadline_ns, &polls))
         return NULL;
-    if (deadline_ns > MAX_NS)
-        return PyErr_Format(PyExc_ValueError, "the deadline is too late");
-    int64_t now_ns;
+    int64_t now_ns, at_ns = deadline_ns < MAX_NS ? deadline_ns : MAX_NS;
     self->count = 0;
     Py_BEGIN_ALLOW_THREADS
-    now_ns = wait_until(self, deadline_ns, polls);
+    now_ns = wait_until(self, at_ns, polls);
     Py_END_ALLOW_THREADS
     /* Here as in a wait of Python: its handlers have run when this returns. */
     return PyErr_CheckSignals() ? NULL : PyLong_FromLongLong(now_ns);

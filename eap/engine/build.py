@@ -120,7 +120,8 @@ class EnginePlant:
     def look_at_keys(self) -> None:
         """Take the keys of files that have changed, and follow the clock of the host."""
         for entry in self._stations.values():
-            entry.look_at_keys()
+            if entry.station.spec.pd_keys:
+                entry.look_at_keys()
 
     def publish_discards(self) -> None:
         """Add the frames that the interfaces dropped since the last call to the counters."""

@@ -147,6 +147,8 @@ def run_cycles(
             if not now_ns:
                 continue
             engine.handle_timeout(now_ns)
+            while engine.is_within_group:
+                engine.handle_timeout(monotonic_ns())
             if rebuilder.is_ready:
                 rebuilder.swap(now_ns)
             if now_ns >= look_ns:

@@ -36,6 +36,8 @@ class Engine:
         """Due time, cycle time and index of each station."""
         self._moment_ns = self._begun_ns = 0
         """Due time and begin of the group that runs."""
+        self.is_within_group = False
+        """True as long as stations of the group that runs are due."""
 
     def drain_on_arrival(self, channels: Iterable[FrameChannel]) -> None:
         """Drain these channels as soon as :meth:`receive` is called."""
@@ -126,6 +128,7 @@ class Engine:
             station.image.words[StationWord.OVERRUNS] += missed
             following_ns += missed * cycle_ns
         heapreplace(self._due, (following_ns, cycle_ns, index))
+        self.is_within_group = self._due[0][0] == self._moment_ns
 
     def receive(self, now_ns: int) -> None:
         """Receive frames between cycles: of channels drained on arrival, and of buses."""

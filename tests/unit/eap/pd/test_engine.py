@@ -116,10 +116,10 @@ def lateness_us(made: Station) -> list[int]:
 
 def run_group(engine: Engine, stations: int, due_ns: int, *behind_us: int) -> None:
     """Run a group of *stations*; the others begin *behind_us* after the first."""
-    for each in (0, *behind_us):
+    for number, each in enumerate((0, *behind_us), start=1):
         assert engine.next_timeout() == due_ns
         engine.handle_timeout(due_ns + each * 1000)
-    assert len(behind_us) == stations - 1
+        assert engine.is_within_group == (number < stations)
 
 
 def test_lateness_in_a_group_counts_from_the_usual_place():
