@@ -20,7 +20,7 @@ import msgspec
 from eap.runtime.folder import VARIABLE
 from eap.runtime.store import VARIABLE as STATE_VARIABLE
 from tools.bench.figures import Bar, BarKind, Figure, at_most
-from tools.bench.machine import ProcessSample, kernel_share, memory_folder
+from tools.bench.machine import ProcessSample, memory_folder
 from tools.bench.network import ROOT, Cable
 from tools.bench.pacing import wait
 
@@ -39,7 +39,6 @@ class Observation(msgspec.Struct, frozen=True):
     Attributes:
         cpu: Share of one core of each process, in the median of WINDOWS; those of segments are
             named after their buses.
-        kernel: Part of *cpu* that was spent in the kernel.
         rss: Octets of each process, likewise.
         lost: Frames lost, over all subscriptions.
         received: PDs received, likewise.
@@ -50,7 +49,6 @@ class Observation(msgspec.Struct, frozen=True):
 
     seconds: float
     cpu: dict[str, float]
-    kernel: dict[str, float]
     rss: dict[str, int]
     lost: int
     received: int
@@ -111,12 +109,10 @@ def observe(plant: Path, seconds: float, link: Cable | None) -> Observation:
                 wait(seconds / WINDOWS)
         last = status(link, environment)
     cpu = {name: _share([each[name] for each in samples], seconds) for name in pids}
-    before, after = samples[0], samples[-1]
     return Observation(
         seconds=seconds,
         cpu=cpu,
-        kernel={name: cpu[name] * kernel_share(before[name], after[name]) for name in pids},
-        rss={name: after[name].rss for name in pids},
+        rss={name: samples[-1][name].rss for name in pids},
         lost=sum(pd["lost"] or 0 for station in last["stations"] for pd in station["pd"]["rx"]),
         received=sum(pd["received"] for station in last["stations"] for pd in station["pd"]["rx"]),
         overruns=sum(s["overruns"] for s in last["stations"]),
@@ -135,24 +131,24 @@ def _share(samples: Sequence[ProcessSample], seconds: float) -> float:
 
 
 def share_figure(
-    plant: str, seen: Observation, process: str, target: float, called: str = ""
+    title: str, seen: Observation, process: str, target: float, floor: tuple[str, float | None]
 ) -> Figure:
-    """Return the share of a core of one process in percent, beside the kernel's part of it.
+    """Return the share of a core of one process in percent.
 
     Args:
-        plant: Name of the plant.
-        seen: Observation of it.
+        title: Name of plant and process.
+        seen: Observation of the plant.
         process: Name of the process there.
         target: Largest share.
-        called: Name of the process in figures, if it has another one.
+        floor: Name of a loop that does the least with the same cycle, and its share of a core;
+            None where it could not run.
     """
-    title = f"{plant}: {called or process}"
-    share, kernel = (side[process] * 100 for side in (seen.cpu, seen.kernel))
-    limit = f"the kernel's part of it: {kernel:.1f} %"
-    bars = [
-        Bar(called or process, share, BarKind.OURS),
-        Bar("kernel's part of it", kernel, BarKind.KERNEL),
-    ]
+    share = seen.cpu[process] * 100
+    bars = [Bar("ours", share, BarKind.OURS)]
+    name, least = floor
+    if least is not None:
+        bars.append(Bar(name, least * 100, BarKind.LIMIT))
+    limit = f"{name}, not measured" if least is None else f"{name}: {least * 100:.1f} %"
     figure = at_most(f"{title}, share of one core", share, target, " %", limit=limit)
     return figure.compared(title, "%", bars, target)
 

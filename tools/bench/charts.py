@@ -22,20 +22,19 @@ text { font: 13px system-ui, "Segoe UI", "DejaVu Sans", sans-serif; fill: #1f232
 .g { font-weight: 600; }
 .s, .l { fill: #59636e; }
 .i { fill: #ffffff; }
-.o { fill: #0969da; } .p { fill: #afb8c1; } .m { fill: #d4a72c; } .k { fill: #0a3069; }
+.o { fill: #0969da; } .p { fill: #afb8c1; } .m { fill: #d4a72c; }
 .a { stroke: #59636e; } .x { stroke: #cf222e; stroke-width: 2; } .xt { fill: #cf222e; }
 @media (prefers-color-scheme: dark) {
 text { fill: #e6edf3; }
 .s, .l { fill: #9198a1; }
 .i { fill: #0d1117; }
-.o { fill: #4493f8; } .p { fill: #656c76; } .m { fill: #bb8009; } .k { fill: #b6d8ff; }
+.o { fill: #4493f8; } .p { fill: #656c76; } .m { fill: #bb8009; }
 .a { stroke: #9198a1; } .x { stroke: #ff7b72; } .xt { fill: #ff7b72; }
 }
 """
-_CLASS = {BarKind.OURS: "o", BarKind.PEER: "p", BarKind.LIMIT: "m", BarKind.KERNEL: "k"}
+_CLASS = {BarKind.OURS: "o", BarKind.PEER: "p", BarKind.LIMIT: "m"}
 _LEGEND_TEXT = {
     BarKind.OURS: "this project",
-    BarKind.KERNEL: "kernel's part of it",
     BarKind.PEER: "peer",
     BarKind.LIMIT: "limit: raw loop",
 }

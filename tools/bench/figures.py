@@ -24,8 +24,6 @@ class BarKind(StrEnum):
     """Owner of a bar of a chart."""
 
     OURS = "ours"
-    KERNEL = "kernel"
-    """The part of ours that the kernel needs."""
     PEER = "peer"
     LIMIT = "limit"
     """The least that a raw loop or an echo does with the same bytes."""

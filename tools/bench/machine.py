@@ -27,14 +27,6 @@ class ProcessSample:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
         self.rss = pages * os.sysconf("SC_PAGE_SIZE")
         """Octets."""
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        self.user_ticks, self.kernel_ticks = int(fields[11]), int(fields[12])
-
-
-def kernel_share(before: ProcessSample, after: ProcessSample) -> float:
-    """Return the part of its processor time that a process spent in the kernel, by its ticks."""
-    kernel = after.kernel_ticks - before.kernel_ticks
-    return kernel / max(kernel + after.user_ticks - before.user_ticks, 1)
 
 
 def describe() -> str:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import socket
 import struct
 from pathlib import Path
-from time import monotonic_ns
+from time import monotonic_ns, process_time_ns
 from typing import Any
 
 from eap.codec.ethercat import ETHERTYPE
 from eap.codec.pd import CYCLE_OFFSET, FIRST_PD, PdHeader
+from eap.net.ticker import Ticker
 from tools.bench.network import Page
 from tools.bench.pacing import BURST, answer, send_for, send_stamps
 from tools.bench.stations import ETHERNET_HEADER, Shape, frame_octets
@@ -93,6 +94,18 @@ def receive_stamps(job: dict[str, Any]) -> None:
             except BlockingIOError:
                 continue
     answer(latencies.summary())
+
+
+def wake(job: dict[str, Any]) -> None:
+    """Wake for each cycle and do nothing; tell the share of a core."""
+    ticker, cycle_ns = Ticker(), job["cycle_us"] * 1000
+    begin_ns = due_ns = monotonic_ns()
+    used_ns = process_time_ns()
+    while due_ns < begin_ns + job["seconds"] * 1e9:
+        due_ns += cycle_ns
+        while not ticker.wait(due_ns):
+            pass
+    answer({"cpu": (process_time_ns() - used_ns) / (monotonic_ns() - begin_ns)})
 
 
 def _open(interface: str) -> socket.socket:

@@ -4,7 +4,8 @@
  *
  * MODE: send, receive, send_paced, receive_stamps as in raw_roles.py; station, which receives and
  * sends one PD each millisecond; exchange, which sends a frame and waits for it, as a master does in
- * a cycle; or segment, which returns frames as slaves in OP do, their process data unchanged.  FRAME is a file with an Ethernet frame, PAGE the words that the
+ * a cycle; segment, which returns frames as slaves in OP do, their process data unchanged; or line,
+ * which sends the frames of the solar line to itself by UDP and receives them in each cycle.  FRAME is a file with an Ethernet frame, PAGE the words that the
  * processes share.  With a BATCH above 1 a call of sendmmsg or recvmmsg moves so many frames; with 0
  * a receiver never sleeps.  tools/bench/rawloop.py defines where counter, stamp and data are.
  */
@@ -12,6 +13,7 @@
 #include <arpa/inet.h>
 #include <fcntl.h>
 #include <net/if.h>
+#include <netinet/in.h>
 #include <netpacket/packet.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -194,6 +196,37 @@ static void segment(void)
     }
 }
 
+static void line(double seconds)
+{
+    enum { MIXED = LINE_SMALL + LINE_LARGE };
+    struct sockaddr_in own = {.sin_family = AF_INET, .sin_addr = {htonl(INADDR_LOOPBACK)}};
+    socklen_t length = sizeof own;
+    int udp = socket(AF_INET, SOCK_DGRAM, 0), buffer = 1 << 20;
+    setsockopt(udp, SOL_SOCKET, SO_RCVBUFFORCE, &buffer, sizeof buffer);
+    if (bind(udp, (struct sockaddr *)&own, length) || getsockname(udp, (struct sockaddr *)&own, &length)
+        || connect(udp, (struct sockaddr *)&own, length))
+        exit(1);
+    int64_t begin = now_ns(), due = begin, received = 0, sent = 0;
+    int64_t used = clock_ns(CLOCK_PROCESS_CPUTIME_ID);
+    while (due < begin + (int64_t)(seconds * 1e9)) {
+        sleep_until(due += LINE_CYCLE_NS);
+        for (int n = 0; n < MIXED; n++)
+            parts[n].iov_len = ROOM;
+        int count = recvmmsg(udp, messages, MIXED, MSG_DONTWAIT, NULL);
+        for (int n = 0; n < count; n++)
+            memcpy(image, frames[n], messages[n].msg_len);
+        received += count > 0 ? count : 0;
+        for (int n = 0; n < MIXED; n++)
+            parts[n].iov_len = HEADERS + (n < LINE_SMALL ? LINE_SMALL_SIZE : LINE_LARGE_SIZE);
+        for (int n = 0; n < MIXED; n++)
+            memcpy(frames[n] + HEADERS, image, parts[n].iov_len - HEADERS);
+        sent += sendmmsg(udp, messages, MIXED, 0);
+    }
+    used = clock_ns(CLOCK_PROCESS_CPUTIME_ID) - used;
+    printf("{\"cpu\":%f,\"sent\":%lld,\"received\":%lld}\n", (double)used / (now_ns() - begin),
+           (long long)sent, (long long)received);
+}
+
 int main(int argc, char **argv)
 {
     if (argc != 7)
@@ -239,5 +272,7 @@ int main(int argc, char **argv)
         exchange(seconds);
     else if (!strcmp(mode, "segment"))
         segment();
+    else if (!strcmp(mode, "line"))
+        line(seconds);
     return 0;
 }

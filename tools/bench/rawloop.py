@@ -29,6 +29,7 @@ _PROGRAM = "rawloop"
 SLAVES = 16
 """Of the segment that the program stands for."""
 _CONSTANTS = {
+    # LINE: the frames of config/solar-line.yaml.
     "ETHERTYPE": ETHERTYPE,
     "CYCLE_AT": ETHERNET_HEADER + CYCLE_OFFSET,
     "DATA_AT": ETHERNET_HEADER + FIRST_PD + PdHeader.SIZE,
@@ -39,6 +40,12 @@ _CONSTANTS = {
     "AL_STATUS": Register.AL_STATUS.value,
     "OP": AlState.OP.value,
     "SLAVES": SLAVES,
+    "HEADERS": FIRST_PD + PdHeader.SIZE,
+    "LINE_CYCLE_NS": 10_000_000,
+    "LINE_SMALL": 26,
+    "LINE_SMALL_SIZE": 600,
+    "LINE_LARGE": 28,
+    "LINE_LARGE_SIZE": 1024,
     "CYCLE_NS": CYCLE_NS,
     "WINDOW": WINDOW,
     "BURST": BURST,

@@ -14,7 +14,6 @@ from tools.bench.figures import Decision
 SEEN = Observation(
     seconds=1.0,
     cpu={"supervisor": 0.0, "engine": 0.04, "services": 0.01, "a/bus0": 0.01, "b/bus0": 0.03},
-    kernel={"supervisor": 0.0, "engine": 0.01, "services": 0.0, "a/bus0": 0.0, "b/bus0": 0.01},
     rss=dict.fromkeys(("supervisor", "engine", "services", "a/bus0", "b/bus0"), 30 << 20),
     lost=0,
     received=1,
@@ -29,11 +28,15 @@ def seen(**changes: Any) -> Observation:
 
 
 def test_demo_names_the_dearest_segment_and_the_memory_of_its_own_processes() -> None:
-    ready, engine, segment, own, everything = demo.figures_of([1.0, 2.0, 1.2], SEEN)
+    ready, engine, segment, own, everything = demo.figures_of([1.0, 2.0, 1.2], 0.9, SEEN, 0.01)
     assert (ready.value, engine.value, segment.value) == (1.2, 4.0, 3.0)
+    assert ready.limit == "CPU time of its imports: 0.9 s"
     assert segment.decision is Decision.MISSED
     assert (own.value, everything.value) == (90.0, 150.0)
-    assert engine.limit == "the kernel's part of it: 1.0 %"
+    assert engine.limit == "a loop that only wakes: 1.0 %"
+    assert (
+        demo.figures_of([1.0], 0.9, SEEN, None)[1].limit == "a loop that only wakes, not measured"
+    )
 
 
 def test_shortest_cycle_is_the_last_good_one() -> None:
