@@ -35,10 +35,10 @@ Event: TypeAlias = tuple[SelectorKey, int]
 
 
 class BusyPollSelector(EpollSelector):
-    """Selector that polls before it sleeps; events of some descriptors are handled inside.
+    """Selector that polls before it sleeps, and handles what arrives without a round of the loop.
 
-    A descriptor that is registered with a function as data belongs to that function: it is called
-    when something arrives, without a detour through the event loop.
+    A descriptor that is registered with a function as data belongs to that function, which is
+    called when something arrives.  Readers of asyncio are called in the same way.
 
     Args:
         report: Called with the error of such a function.
@@ -74,10 +74,10 @@ class BusyPollSelector(EpollSelector):
                 return []
             self._is_quick = self._clock() - began_ns < QUICK_NS
             others = self._handle(events)
-            began_ns = self._clock()
-            if others or self.has_work or began_ns >= end_ns:
+            if others or self.has_work:
                 return others
             # All was handled here: the loop would only come back.
+            began_ns = self._clock()
             events = self._poll(began_ns, end_ns)
         return self._handle(events)
 
@@ -103,18 +103,34 @@ class BusyPollSelector(EpollSelector):
         return []
 
     def _handle(self, events: list[Event]) -> list[Event]:
-        """Handle the events of descriptors with functions; return the others."""
-        others = []
-        for event in events:
-            handle = event[0].data
-            if not callable(handle):
-                others.append(event)
-                continue
+        """Handle the events of watched descriptors and of readers; return the others."""
+        if len(events) == 1:
+            return [] if self._handle_one(*events[0]) else events
+        others = [
+            event for event in events if self._is_current(event[0]) and not self._handle_one(*event)
+        ]
+        return [event for event in others if self._is_current(event[0])]
+
+    def _is_current(self, key: SelectorKey) -> bool:
+        """Return whether an event is still for the one who registered the descriptor."""
+        # Another event may have closed it, and a new descriptor may have its number.  An event that
+        # is left out comes again.
+        return self.get_map().get(key.fd) is key
+
+    def _handle_one(self, key: SelectorKey, mask: int) -> bool:
+        """Handle an event, unless it is for the loop; return whether it was not."""
+        if callable(key.data):
             try:
-                handle()
+                key.data()
             except Exception as exc:  # noqa: BLE001  as the loop does with its callbacks
                 self._report(exc)
-        return others
+            return True
+        reader, _ = key.data
+        if mask != EVENT_READ or not isinstance(reader, asyncio.Handle):
+            return False
+        # The loop would do the same, after two more steps for each event.
+        reader._run()  # noqa: SLF001
+        return True
 
 
 class BusyPollLoop(asyncio.SelectorEventLoop):

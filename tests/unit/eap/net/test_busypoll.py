@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import os
 import socket
 from collections.abc import Iterator
+from contextlib import ExitStack
 from selectors import EVENT_READ, EpollSelector
 
 import pytest
@@ -215,6 +217,100 @@ def test_selector_reports_the_error_of_a_function_and_goes_on(line):
     assert [str(each) for each in line.errors] == ["broken"]
 
 
+@pytest.mark.parametrize("how", ["watch", "add_reader"])
+def test_loop_leaves_out_events_of_descriptors_that_another_event_replaced(how):
+    """Two sockets are ready; the first to be handled replaces both by others."""
+
+    async def serve() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, BusyPollLoop)
+        done = loop.create_future()
+        add, remove = (
+            (loop.watch, loop.unwatch) if how == "watch" else (loop.add_reader, loop.remove_reader)
+        )
+        calls = []
+
+        def replace_both() -> None:
+            calls.append("first")
+            for near in nears:
+                remove(near.fileno())
+                near.detach()
+            for fd, (other, far) in zip(fds, others, strict=True):
+                os.dup2(other.fileno(), fd)
+                add(fd, lambda: done.done() or done.set_result("the new one"))
+                far.send(b"x")
+
+        for near, far in zip(nears, fars, strict=True):
+            add(near.fileno(), replace_both)
+            far.send(b"x")
+        assert await done == "the new one"
+        assert calls == ["first"]
+        for fd in fds:
+            remove(fd)
+
+    with ExitStack() as stack:
+        pairs = [socket.socketpair() for _ in range(4)]
+        for near, far in pairs:
+            stack.callback(near.close)
+            stack.callback(far.close)
+        nears, fars = zip(*pairs[:2], strict=True)
+        others = pairs[2:]
+        fds = [near.fileno() for near in nears]
+        for fd in fds:
+            stack.callback(os.close, fd)
+        with asyncio.Runner(loop_factory=BusyPollLoop) as runner:
+            runner.run(serve())
+
+
+def test_loop_calls_readers_and_writers_of_asyncio():
+    async def serve() -> None:
+        async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            while octets := await reader.read(1 << 16):
+                writer.write(octets)
+                await writer.drain()
+            writer.close()
+
+        server = await asyncio.start_server(echo, "127.0.0.1", 0)
+        reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+        content = os.urandom(5_000_000)  # more than the socket buffers
+        send = asyncio.create_task(_send(writer, content))
+        assert await reader.readexactly(len(content)) == content
+        await send
+        writer.close()
+        await writer.wait_closed()
+        server.close()
+        await server.wait_closed()
+
+    with asyncio.Runner(loop_factory=BusyPollLoop) as runner:
+        runner.run(serve())
+
+
+async def _send(writer: asyncio.StreamWriter, content: bytes) -> None:
+    writer.write(content)
+    await writer.drain()
+
+
+def test_loop_reports_the_error_of_a_reader():
+    async def serve() -> str:
+        loop = asyncio.get_running_loop()
+        found = loop.create_future()
+        loop.set_exception_handler(
+            lambda _, context: found.done() or found.set_result(str(context["exception"]))
+        )
+
+        def fail() -> None:
+            near.recv(1)
+            raise ValueError("broken")
+
+        loop.add_reader(near.fileno(), fail)
+        far.send(b"a")
+        return await found
+
+    near, far = socket.socketpair()
+    with near, far, asyncio.Runner(loop_factory=BusyPollLoop) as runner:
+        assert runner.run(serve()) == "broken"
+
+
 def test_loop_calls_a_watcher_until_it_is_removed():
     async def serve() -> None:
         loop = asyncio.get_running_loop()
@@ -276,6 +372,15 @@ def test_loop_runs_what_a_watcher_scheduled_at_once():
     near, far = socket.socketpair()
     with near, far, asyncio.Runner(loop_factory=BusyPollLoop) as runner:
         runner.run(serve())
+
+
+@pytest.mark.parametrize("schedule", ["call_soon", "call_later"])
+def test_loop_notes_what_is_scheduled(schedule):
+    loop = BusyPollLoop()
+    assert not loop._polling.has_work
+    getattr(loop, schedule)(*(() if schedule == "call_soon" else (1,)), int)
+    assert loop._polling.has_work
+    loop.close()
 
 
 def test_loop_that_is_closed_has_no_watchers():
