@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from enum import Enum, auto
+from functools import lru_cache
 from ipaddress import IPv4Address
 from typing import NamedTuple, Self
 from urllib.parse import parse_qsl, urlencode
@@ -290,3 +291,9 @@ class Endpoint(NamedTuple):
     def __str__(self) -> str:
         # A transport to a single address is named after it: print the address once.
         return f"{self.connection} by {self.transport.removesuffix(f':{self.connection}')}"
+
+
+@lru_cache(4096)
+def endpoint_of(transport: str, connection: str) -> Endpoint:
+    """Return an endpoint, the same object as before for each of the latest ones."""
+    return Endpoint(transport, connection)

@@ -399,7 +399,7 @@ class Forwarder:
         allowed = self._limits.timeout_ns
         if route is not None:
             allowed = route.timeout_ns or allowed
-            self._record.routes.of(route.key, now_ns).add_request(len(data))
+            self._record.add_forwarded(route.key, len(data), now_ns)
         pending = Pending(
             invoke_id, header, endpoint, route, onward, now_ns, now_ns + allowed,
             may_repeat=self.admission.may_repeat(endpoint),
@@ -426,7 +426,7 @@ class Forwarder:
         else:
             invoke_id = self._ids.allocate(self.in_flight)
         self._loop_detector.add(invoke_id, onward)
-        self._record.routes.of(route.key, now_ns).add_request(len(data))
+        self._record.add_forwarded(route.key, len(data), now_ns)
         return [self._forward(invoke_id, data, onward, route)]
 
     def _forward(self, invoke_id: int, data: bytes, onward: bytes, route: Route) -> Action:

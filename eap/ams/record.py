@@ -160,8 +160,8 @@ MAX_LATEST = 256
 class Record:
     """Traces, counters and traffic of a router.
 
-    A request that was simply answered is counted after its answer was sent, by :meth:`settle`; all
-    that is read here has it.
+    Requests, and those that were simply answered, are only noted at first: :meth:`settle` counts
+    them while packets are on their way.  All that is read here has them.
     """
 
     def __init__(self) -> None:
@@ -170,6 +170,8 @@ class Record:
         self._connections: TrafficTable[Endpoint] = TrafficTable()
         self._routes: TrafficTable[RouteKey] = TrafficTable()
         self._events: deque[Trace] = deque(maxlen=MAX_EVENTS)
+        self._request: tuple[Endpoint, int, NetId, int] | None = None
+        self._forwarded: tuple[RouteKey, int, int] | None = None
         self._answered: tuple[Trace, Endpoint, RouteKey | None, int] | None = None
 
     @property
@@ -196,6 +198,17 @@ class Record:
         self.settle()
         return self._routes
 
+    def add_request(self, endpoint: Endpoint, octets: int, source: NetId, at_ns: int) -> None:
+        """Add a request of a client with the NetID *source*."""
+        self.settle()
+        self._request = endpoint, octets, source, at_ns
+
+    def add_forwarded(self, route: RouteKey, octets: int, at_ns: int) -> None:
+        """Add a request that was forwarded."""
+        if self._forwarded is not None:
+            self.settle()
+        self._forwarded = route, octets, at_ns
+
     def add_answered(
         self, trace: Trace, endpoint: Endpoint, route: RouteKey | None, octets: int
     ) -> None:
@@ -207,21 +220,29 @@ class Record:
             route: That the request was forwarded by.
             octets: Size of the answer.
         """
-        self.settle()
+        if self._answered is not None:
+            self.settle()
         self._answered = trace, endpoint, route, octets
 
     def settle(self) -> None:
-        """Count the request that was answered last."""
-        if self._answered is None:
-            return
-        trace, endpoint, route, octets = self._answered
-        self._answered = None
-        self._connections.of(endpoint, trace.at_ns).add_answer(octets, trace.took_ns)
-        if route is not None:
-            self._routes.of(route, trace.at_ns).add_answer(octets, trace.took_ns)
-        self._counts[_ANSWERED] += 1
-        if not _is_probe(trace):
-            self._latest.append(trace)
+        """Count what was noted last."""
+        if self._request is not None:
+            endpoint, octets, source, at_ns = self._request
+            self._request = None
+            self._connections.of(endpoint, at_ns).add_request(octets, source)
+        if self._forwarded is not None:
+            route, octets, at_ns = self._forwarded
+            self._forwarded = None
+            self._routes.of(route, at_ns).add_request(octets)
+        if self._answered is not None:
+            trace, endpoint, by, octets = self._answered
+            self._answered = None
+            self._connections.of(endpoint, trace.at_ns).add_answer(octets, trace.took_ns)
+            if by is not None:
+                self._routes.of(by, trace.at_ns).add_answer(octets, trace.took_ns)
+            self._counts[_ANSWERED] += 1
+            if not _is_probe(trace):
+                self._latest.append(trace)
 
     @property
     def has_events(self) -> bool:

@@ -23,7 +23,7 @@ from eap.ams.transport_table import Action, Deliver, Reply, Transport, Transport
 from eap.codec.ads import AdsError
 from eap.codec.ams import AmsAnswer, AmsCommand, AmsHeader, StateFlags, decode_packet
 from eap.errors import CodecError, MalformedError
-from eap.ids import Endpoint, NetId
+from eap.ids import Endpoint, NetId, endpoint_of
 
 _RESPONSE = StateFlags.RESPONSE.value  # plain numbers: enums and operators of flags are slow
 _FRAGMENT = AmsCommand.FRAGMENT.value
@@ -152,7 +152,7 @@ class Router:
             now_ns: The time on the monotonic clock.
             is_broadcast: Whether other routers got it too: then only its target answers.
         """
-        endpoint = Endpoint(transport, connection)
+        endpoint = endpoint_of(transport, connection)
         try:
             header = AmsHeader.decode(data)
             end = AmsHeader.SIZE + header.length
@@ -260,7 +260,7 @@ class Router:
         return self.record.has_events or self.access_filter.has_entries
 
     def settle(self) -> None:
-        """Count what was answered, when the answers have been sent."""
+        """Count requests and answers, after the actions for them were carried out."""
         self.record.settle()
 
     def next_event(self) -> Trace | None:
@@ -338,7 +338,7 @@ class Router:
         # Every station of the segment got it: only its target answers, none forwards it.
         if ports is None and is_broadcast:
             return []
-        self.record.connections.of(endpoint, now_ns).add_request(len(data), header.source)
+        self.record.add_request(endpoint, len(data), header.source, now_ns)
         if header.command == _NOTIFICATION:
             is_own = ports is not None
             return self._forwarder.forward_notification(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from eap.codec.mailbox import MailboxError, encode_plain_frame
 from eap.errors import MalformedError, TruncatedError
 from eap.gateway.requests import mailbox_error
-from eap.ids import Endpoint
+from eap.ids import Endpoint, endpoint_of
 from eap.runtime.drop_counters import DropReason
 from eap.runtime.handover import PortName
 from eap.services.transports.mailbox_frames import refusal_of
@@ -93,7 +93,7 @@ class GatewayTransport:
             send(connection, frame)
 
         try:
-            gateway.receive(frame, Endpoint(name, connection), answer)
+            gateway.receive(frame, endpoint_of(name, connection), answer)
         except TruncatedError:
             return DropReason.TRUNCATED
         except MalformedError:

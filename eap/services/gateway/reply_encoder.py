@@ -213,13 +213,6 @@ class ReplyEncoder:
         took_ns: int,
     ) -> None:
         """Answer a request from *address*; it is counted for *station*."""
-        reasons = [each.reason for each in replies]
-        kind = request.header.type
-        self.statistics.count(station, kind, reasons, took_ns)
-        is_overdue = any(each.is_overdue for each in replies)
-        self._count_errors(request, kind, reasons, is_overdue=is_overdue)
-        if replies and replies[0].is_repeat:
-            self._count_repeat(request.endpoint)
         # Released before the answer goes out: the client may send the same bytes anew at once.
         if address == request.header.address:  # not one of many
             request.release()
@@ -227,6 +220,14 @@ class ReplyEncoder:
             if reply.reason is not None and self._is_silent:
                 continue
             self.send(request.send, address, reply.type, reply.body)
+        # Counted behind the answer, while it is on its way.
+        reasons = [each.reason for each in replies]
+        kind = request.header.type
+        self.statistics.count(station, kind, reasons, took_ns)
+        is_overdue = any(each.is_overdue for each in replies)
+        self._count_errors(request, kind, reasons, is_overdue=is_overdue)
+        if replies and replies[0].is_repeat:
+            self._count_repeat(request.endpoint)
 
     def answer_dialect(
         self,

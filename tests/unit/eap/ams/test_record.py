@@ -118,6 +118,20 @@ def test_record_counts_an_answered_request_before_anything_is_read() -> None:
         assert not record.has_events
 
 
+def test_record_counts_noted_requests_before_anything_is_read() -> None:
+    source = NetId.parse("5.1.1.1.1.1")
+    endpoint, key = Endpoint("tcp", "1"), (source, Endpoint("link", "2"))
+    record = Record()
+    for number in (1, 2):
+        record.add_request(endpoint, 44, source, number)
+        record.add_forwarded(key, 40, number)
+    expected = Traffic(1, requests=2, request_bytes=88, sources=(source,))
+    assert record.connections.snapshot() == {endpoint: expected}
+    assert record.routes.snapshot() == {key: Traffic(1, requests=2, request_bytes=80)}
+    record.settle()
+    assert record.connections.snapshot() == {endpoint: expected}, "counted once"
+
+
 def test_record_keeps_the_order_of_traces() -> None:
     record = Record()
     endpoint = Endpoint("tcp", "1")
