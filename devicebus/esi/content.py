@@ -61,7 +61,7 @@ def list_devices(stream: BinaryIO) -> EsiList:
     Raises OSError only.
     """
     fields = Fields()
-    found: list[_Head] = []
+    found: list[_DeviceHead] = []
     wanted = (_VENDOR, *(f"{_DEVICE}/{tag}" for tag in _HEAD))
     vendor, vendor_name = 0, ""
     for element in _read(stream, fields, wanted):
@@ -71,7 +71,7 @@ def list_devices(stream: BinaryIO) -> EsiList:
             if len(found) == MAX_DEVICES:
                 fields.report(element.line, f"more than {MAX_DEVICES} devices", "a smaller file")
                 break
-            found.append(_Head(element, [], []))
+            found.append(_DeviceHead(element, [], []))
         elif found:
             (found[-1].hides if element.tag == "HideType" else found[-1].names).append(element)
     return EsiList(
@@ -113,7 +113,7 @@ def load_device(stream: BinaryIO, listed: ListedDevice) -> DeviceResult:
     return DeviceResult(None, tuple(fields.findings))
 
 
-class _Head(NamedTuple):
+class _DeviceHead(NamedTuple):
     """Elements of a device for the list."""
 
     type: XmlElement
@@ -121,7 +121,7 @@ class _Head(NamedTuple):
     names: list[XmlElement]
 
 
-def _listed(number: int, vendor: int, head: _Head, fields: Fields) -> ListedDevice:
+def _listed(number: int, vendor: int, head: _DeviceHead, fields: Fields) -> ListedDevice:
     device = XmlElement("Device", {}, head.type.line)
     device.children = [head.type, *head.names]
     own = identify(device, fields)

@@ -63,6 +63,7 @@ class AdsError(IntEnum):
     @classmethod
     def name_of(cls, code: int) -> str:
         """Return the name of a code, or its number for one that nothing here sends."""
+        # Devices of others send codes of their own.
         return cls(code).name if code in cls._value2member_map_ else f"0x{code:x}"
 
     @classmethod

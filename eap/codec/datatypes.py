@@ -271,6 +271,7 @@ class _Parser:
             return _BASE[base]
         if not self._is_word:
             self._fail()
+        # All spellings: people write types as in the language that they know.
         known = [*_BASE, *_SIZED, *_ALIASES]
         if self._definitions:
             known += self._definitions.names()
@@ -336,12 +337,14 @@ class _Parser:
         self._skip()
         if is_base_name(name):
             raise ValueError(f"{self._shown} gives {name} another meaning: expected another name")
+        # Only a structure begins with a number, its size.
         if _NUMBER.match(self._text, self._at):
             kind = self._structure(name, depth)
         else:
             base = self._type(depth + 1)
             kind = self._enumeration(name, base) if self._take(":") else base.named(name)
         self._expect(">")
+        # Whoever uses the type twice describes it once: the second time its name is enough.
         self._own[name] = kind
         return kind
 

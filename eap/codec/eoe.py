@@ -169,6 +169,7 @@ class IpSettings(msgspec.Struct, frozen=True):
         mac = take(_Flag.MAC, 6)
         ip, mask, gateway, dns = map(address, (_Flag.IP, _Flag.MASK, _Flag.GATEWAY, _Flag.DNS))
         name = take(_Flag.NAME, NAME_SIZE)
+        # All 32 bytes may be used: a NUL ends only a shorter name.
         text = None if name is None else name.partition(b"\0")[0].decode(errors="replace")
         return cls(None if mac is None else MacAddr(mac), ip, mask, gateway, dns, text)
 

@@ -85,6 +85,7 @@ class Busy(NamedTuple):
     @classmethod
     def of(cls, number: int) -> Busy:
         """Take the two words of a BUSY message apart."""
+        # The standard has no unit for them: only their ratio says anything.
         return cls(number & 0xFFFF, number >> 16)
 
     @property

@@ -14,6 +14,7 @@ import msgspec
 Literal: TypeAlias = "str | list[Literal] | dict[str, Literal]"
 """Parts of a value: single ones are texts, for the type to read."""
 
+# The reader calls itself: text of brackets only must not exhaust the stack.
 MAX_DEPTH = 32
 _SPACE = re.compile(r"\s*")
 _QUOTED = re.compile(r""""((?:[^"\\]|\\.)*)"|'((?:[^']|'')*)'""", re.DOTALL)
@@ -53,6 +54,7 @@ def _quoted(text: str) -> str:
     """Return *text* with quotes where it needs them."""
     if text and text.isprintable() and text == text.strip() and not _SIGNS.search(text):
         return text
+    # Only double quotes know escapes: a raw line break would not survive a shell.
     if not text.isprintable():
         return msgspec.json.encode(text).decode()
     return "'" + text.replace("'", "''") + "'"
@@ -103,6 +105,7 @@ class _LiteralReader:
             if members and not self.take(","):
                 raise self._error("a comma or }")
             name = self._single(_NAME)
+            # One of the two is a slip of typing, and nothing says which.
             if name in members:
                 raise ValueError(f"member {name!r} is given twice: expected each once")
             if not (self.take(":") or self.take("=")):

@@ -232,6 +232,7 @@ def decode_request(pdu: bytes) -> ModbusRequest:
             first, count = struct.unpack_from(">HH", pdu, 1)
             read = _checked_read(ModbusTable.HOLDING, first, count)
             return ModbusReadWrite(read, _written(ModbusTable.HOLDING, function, pdu, 5))
+    # Surplus bytes count as wrong, too: the master means something that this does not know.
     except (struct.error, IndexError):
         why = f"function {function} with {len(pdu)} bytes"
         raise ModbusRefusalError(ModbusException.VALUE, why) from None
@@ -247,6 +248,7 @@ def _checked_read(table: ModbusTable, first: int, count: int) -> ModbusRead:
 
 def _write_coil(pdu: bytes) -> ModbusWrite:
     first, value = struct.unpack(">HH", pdu[1:])
+    # The standard has no third value: a device that took any as "on" would hide a wrong master.
     if value not in {0, _ON}:
         raise ModbusRefusalError(ModbusException.VALUE, f"coil value {value:#06x}")
     return ModbusWrite(ModbusTable.COILS, first, 1, bytes((value == _ON,)), pdu[0])
@@ -262,6 +264,7 @@ def _written(table: ModbusTable, function: int, pdu: bytes, at: int) -> ModbusWr
     data = pdu[at + 5 :]
     most = MAX_WRITTEN_BITS if table.is_bits else MAX_WRITTEN_REGISTERS
     needed = -(-count // 8) if table.is_bits else 2 * count
+    # Count and length say the same twice: where they differ, writing a part would be a guess.
     if not 1 <= count <= most or size != needed or len(data) != needed:
         why = f"{count} values in {len(data)} bytes"
         raise ModbusRefusalError(ModbusException.VALUE, why)
@@ -300,6 +303,7 @@ def decode_reply(pdu: bytes, request: bytes) -> ModbusReply:
         CodecError: it is the reply to another request, or incomplete.
     """
     function = request[0]
+    # Exceptions are looked for first: their function code differs from the request, too.
     if len(pdu) >= 2 and pdu[0] == function | _EXCEPTION:
         return ModbusReply(exception=pdu[1])
     if not pdu or pdu[0] != function:

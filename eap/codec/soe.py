@@ -192,6 +192,7 @@ def encode_fragments(header: SoeHeader, body: Buffer, max_size: int) -> list[byt
     view = memoryview(body)
     pieces = [view[at : at + max_size] for at in range(0, len(view), max_size)] or [view]
     messages = []
+    # An empty value is one message, too: the answer must come.
     for left, piece in zip(range(len(pieces) - 1, -1, -1), pieces, strict=True):
         head = SoeHeader(
             header.opcode,
@@ -225,6 +226,7 @@ def decode_list(body: Buffer) -> tuple[ListHead, bytes]:
         raise TruncatedError(
             f"length {head.length}, but {len(octets)} bytes follow", layout="ListHead"
         )
+    # A list of which the current length is beyond its own maximum is damaged, whatever follows.
     if head.length > head.max_length:
         raise MalformedError(
             f"length {head.length} of at most {head.max_length}", layout="ListHead"
@@ -356,6 +358,7 @@ def decode_value(attribute: SoeAttribute, body: Buffer) -> SoeValue:
         return decode_scalar(attribute, body)
     _, octets = decode_list(body)
     if attribute.display == Display.TEXT:
+        # Replaced, not refused: one odd byte must not hide the rest of the text.
         return octets.rstrip(b"\0").decode(errors="replace")
     if len(octets) % attribute.size:
         raise MalformedError(

@@ -122,6 +122,7 @@ def _encode_float(number: int, value: float) -> bytes:
     try:
         octets = _FLOAT_LAYOUT.pack(value)
     except OverflowError:
+        # As processors convert it: a value that is too large must not hold back the others.
         octets = _FLOAT_LAYOUT.pack(float("inf") if value > 0 else float("-inf"))
     return encode_tag(number, FIXED32) + octets
 
@@ -263,6 +264,7 @@ def _decode_value(
     if shape == _TEMPLATE:
         return _decode_template(_octets(content), room, depth)
     value = _DECODERS[shape](content)
+    # The wire has two's complement: only the type says whether it is negative.
     return signed(value, kind) if shape in {_INT, _LONG} else value
 
 

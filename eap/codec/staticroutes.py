@@ -123,6 +123,7 @@ def _route(element: XmlElement) -> StaticRoute:
         element.findtext("NetId"),
         element.findtext("Address"),
         element.findtext("Type") or TCP_IP,
+        # Kept unread, therefore cut: the file may be of anyone.
         element.findtext("Flags")[:_MAX_KEPT],
         element.findtext("Timeout")[:_MAX_KEPT],
         element.attribute_flag("Unidirectional"),
@@ -145,6 +146,7 @@ def _broker(element: XmlElement) -> StaticBroker:
         element.findtext("Tls/Cert"),
         tls is not None,
         psk is not None,
+        # The import says that a secret has to be given again, without ever having it.
         any(element.findtext(path) for path in secrets),
         element.attribute_flag("Unidirectional"),
     )

@@ -196,6 +196,7 @@ def to_request(kind: MailboxType, wanted: BusAskParameters) -> MailboxRequest:
         kind,
         to_octets(wanted.request),
         listen=wanted.listen,
+        # Milliseconds in JSON: its numbers are doubles in many languages, which nanoseconds exceed.
         timeout_ns=wanted.timeout_ms * MS,
         delay_ns=wanted.delay_ms * MS,
         expects_reply=wanted.expects_reply,

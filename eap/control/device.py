@@ -357,6 +357,7 @@ def _entry_fields(subindex: int, entry: Entry) -> dict[str, Any]:
         "type": entry.kind.text,
         "bits": entry.kind.bit_length,
         "access": reads + ("w" if entry.access & Access.WRITE_ANY else ""),
+        # Beside the short form for people: ETG.1000.6 has rights for each state.
         "rights": int(entry.access),
         "unit": _UNIT_TEXTS.get(entry.unit, ""),
         "default": entry.default.hex(),
@@ -394,6 +395,7 @@ def apply_answer(plan: Plan, fault: DeviceFault | None) -> ApplyAnswer:
 
 
 def _is_final(port: str, change: EntryChange) -> bool:
+    # Called with the pair as plans have it.
     del port
     return not change.interim
 

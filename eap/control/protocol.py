@@ -312,6 +312,7 @@ def parameters(params: dict[str, Any], kind: type[ParametersT]) -> ParametersT:
 def of_station(name: str, known: Mapping[str, ItemT]) -> ItemT:
     """Return the item of *known* for a station; raise ControlError that suggests similar names."""
     try:
+        # The name is of a user: a suggestion costs less than a look into the plant file.
         return known[name]
     except KeyError:
         reason = f"unknown station {name!r}{suggest(name, known)}"
@@ -334,6 +335,7 @@ def request_id(line: bytes) -> int | None:
         number = msgspec.json.decode(line)["id"]
     except (ValueError, RecursionError, KeyError, TypeError):
         return None
+    # An id of another type could not be the one of a request.
     return number if isinstance(number, int) else None
 
 

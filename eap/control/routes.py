@@ -137,6 +137,7 @@ class RoutesAddRemoteParameters(Parameters, frozen=True, kw_only=True):
     fingerprint: Text = ""
 
 
+# A base of two records: both show the same columns, whoever opened the path.
 class EndpointRow(Document, frozen=True, kw_only=True):
     """One path of packets, and the figures of its requests.
 
@@ -295,6 +296,7 @@ class TestResult(Document, frozen=True, kw_only=True):
         hint: Remedy; empty for none.
     """
 
+    # pytest takes classes whose names begin with Test for tests.
     __test__ = False
 
     target: str
@@ -534,6 +536,7 @@ def hop_row(report: HopReport, took_us: int, spent_us: int, *, is_opaque: bool) 
         why=report.why,
         interrupted=report.interrupted,
         interrupted_s=report.interrupted_s,
+        # JSON has only texts as names.
         may={str(service): allowed for service, allowed in report.may.items()},
         took_us=took_us,
         spent_us=spent_us,

@@ -93,6 +93,7 @@ class FramesFile:
     def lost(self) -> int:
         """Frames that the recorder did not get."""
         told = sum(each.count for each in self.events if each.kind is EventKind.LOST)
+        # Events and the statistics of the interfaces tell of the same losses.
         return max(told, self._lost or 0)
 
     @property
@@ -105,6 +106,7 @@ class FramesFile:
 
         With *once*, received frames are left out where the ports of all senders were recorded.
         """
+        # A frame that one station sent to another was recorded at both ports.
         leaves_out = once and bool(self._own) and set(self._own.values()) <= set(self.interfaces)
         with self.path.open("rb") as file:
             for captured in _tolerant(CaptureFile(file, str(self.path))):
@@ -194,6 +196,7 @@ class FramesFile:
                 self.last_ns = at_ns if self.last_ns is None else max(self.last_ns, at_ns)
                 self.events += events_in(packet.comments)
         except MalformedError:
+            # A recorder that was killed leaves a block cut off: what is before it is kept.
             if not capture.interfaces:
                 raise
             self.is_finished = False
@@ -209,6 +212,7 @@ class FramesFile:
         self._messages.append(messages)
         self._placed.append((frame.station, pd))
         self.sources[number] = source_of(messages)
+        # With version and size: data of another layout would be read as wrong values.
         self._pds[frame.publisher, pd.pd_id, pd.version, pd.size] = number
 
 
@@ -247,6 +251,7 @@ def _section(
             published += part
         elif head.startswith(FILE_COMMENT):
             name = head[len(FILE_COMMENT) :].rpartition(" ")[0]
+            # A comment has at most 65,535 bytes: longer files come in parts.
             files[name] = files.get(name, b"") + part
     try:
         frames = decode_published(published) if published else ()

@@ -119,6 +119,7 @@ def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
         base = re.sub(r"\W", "_", name, flags=re.ASCII)
         base = f"_{base}" if not base or base[0].isdigit() else base
         field, number = base, 1
+        # a.b and a_b have the same identifier.
         while field in used:
             number += 1
             field = f"{base}_{number}"
@@ -130,6 +131,7 @@ def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
 def _field_numbers(first: int) -> Iterator[int]:
     number = first
     while True:
+        # protoc refuses a schema that uses them.
         if number == _RESERVED.start:
             number = _RESERVED.stop
         yield number
@@ -249,6 +251,7 @@ def write_leaf(leaf: Leaf, sample: bytearray, value: Any) -> None:
     elif isinstance(kind, Block | Boolean | Real):
         sample[offset : offset + kind.size] = kind.encode(value)
     else:
+        # Eight bytes for all, then cut: so a type without sign takes the same way.
         octets = int(value).to_bytes(8, "little", signed=value < 0)
         sample[offset : offset + kind.size] = octets[: kind.size]
 
@@ -269,6 +272,7 @@ _SAMPLE_CODES = {
 def _is_copied(leaf: Leaf) -> bool:
     """Return whether sample and message have the same bytes for *leaf*."""
     kind = field_type(leaf.kind)
+    # Bits have to be shifted to their place.
     if leaf.kind.is_bits or leaf.bit_offset % 8:
         return False
     if kind is ProtobufType.BYTES:
@@ -375,6 +379,7 @@ def _encode(parts: Iterable[_Part], sample: bytes) -> bytes:
             value = read_leaf(part, sample)
             kind = field_type(part.kind)
             if kind is ProtobufType.STRING:
+                # A WSTRING may have half of a surrogate pair, which UTF-8 has not.
                 found += value.encode("utf-8", "replace")
             elif kind is ProtobufType.BYTES:
                 found += value
@@ -403,6 +408,7 @@ class _PartReader:
                 if inner > end:
                     raise self._damaged()
                 yield from self.read(part.parts, inner)
+                # Else the next part would be read from the middle of this one.
                 if self.at != inner:
                     raise self._damaged()
             else:
@@ -425,6 +431,7 @@ class _PartReader:
 
     def _varint(self, end: int) -> int:
         number = 0
+        # No length needs more than five bytes: a damaged one must not go on and on.
         for shift in range(0, 35, 7):
             octet = self._take(1, end)[0]
             number |= (octet & 0x7F) << shift
@@ -477,6 +484,7 @@ class StationMessages:
             kind = datatypes.parse(variable.type)
             fields.append((variable, list(_parts(number, variable.name, kind, bit_offset))))
         self.variables = tuple(variable for variable, _ in fields)
+        # In front, where each has its place: reading them is one unpack.
         fixed = [each for each in fields if _fixed_sizes(each[1]) is not None]
         varying = [each for each in fields if _fixed_sizes(each[1]) is None]
         self._varying = [part for _, parts in varying for part in parts]

@@ -54,6 +54,7 @@ def write_parquet(
         ]
         for source, chosen in selection.items()
     }
+    # Never over a file that is there: it may be the only copy of an earlier export.
     with path.open("xb") as file, parquet.ParquetWriter(file, schema, compression="zstd") as writer:
         batch = _Batch(writer, schema, names)
         for at_ns, rows in merged_rows(recording.rows(window, plans.keys())):
@@ -105,8 +106,10 @@ def _arrow_type(kind: DataType) -> Any:
         return pa.float32() if kind.size == 4 else pa.float64()
     if isinstance(kind, Block):
         return pa.binary(kind.size)
+    # Names, not numbers: the file goes to people who do not have the description of the type.
     if isinstance(kind, Text | WideChar | Enumeration | Timed):
         return pa.string()
     is_signed = isinstance(kind, Integer) and kind.signed
+    # Arrow has no integers of 3, 5, 6 or 7 bytes.
     size = next(each for each in (1, 2, 4, 8) if each >= kind.size)
     return getattr(pa, f"{'int' if is_signed else 'uint'}{8 * size}")()

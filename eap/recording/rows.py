@@ -90,6 +90,7 @@ class ValueRow(NamedTuple):
 def plain_value(kind: DataType, value: Any) -> Any:
     """Return a leaf's value as files of text have it: enumerations by name, times as texts."""
     if isinstance(kind, Enumeration | Timed):
+        # The file has the wire value as a number of 4 or 8 bytes, the type may have fewer.
         octets = int(value).to_bytes(8, "little", signed=value < 0)[: kind.size]
         return kind.to_plain(kind.decode(octets, 0))
     return value.hex() if isinstance(value, bytes) else value
@@ -120,6 +121,8 @@ def select(
         for position, column in enumerate(source.columns):
             names = [name for name, matches in matchers if matches(column)]
             for name in names:
+                # A misspelled name is reported: a file without its column would be found much
+                # later.
                 unused.pop(name, None)
             if names or not patterns:
                 found.setdefault(number, {})[position] = column

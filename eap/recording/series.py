@@ -40,11 +40,13 @@ class Series:
 
     def finite(self) -> Iterator[float]:
         """Yield all values that are finite numbers."""
+        # NaN is no value; an infinite one would leave no scale for the others.
         return (each for each in self.values if each - each == 0)
 
     def usual_step_ns(self) -> int:
         """Return the median distance of two values, of at most 1000 of them."""
         count = min(len(self.times), 1000)
+        # The median: an interruption lasts as long as it likes, and must not count.
         steps = sorted(self.times[n + 1] - self.times[n] for n in range(count - 1))
         return steps[len(steps) // 2] if steps else 0
 
@@ -94,6 +96,7 @@ def lines(series: Series, from_ns: int, until_ns: int, width: int) -> list[list[
     last_ns: int | None = None
     column: _Column | None = None
     for at_ns, value in zip(series.times, series.values, strict=True):
+        # A line across a gap would show values that nobody measured.
         is_gap = isnan(value) or (last_ns is not None and gap_ns and at_ns - last_ns > gap_ns)
         if is_gap and (line or column):
             found.append(line + (column.points() if column else []))
@@ -138,6 +141,7 @@ def _steps(line: Sequence[Point]) -> list[Point]:
     """Return *line* with a value held until the next one."""
     found: list[Point] = []
     for point in line:
+        # A slope would show a time at which a switch is neither on nor off.
         if found and found[-1].value != point.value:
             found.append(Point(point.x, found[-1].value))
         found.append(point)

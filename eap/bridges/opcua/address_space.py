@@ -83,6 +83,7 @@ class PlantAddressSpace:
     async def follow(self, plan: NodePlan) -> PlanChange:
         """Enter the nodes of *plan* and remove all others; return the difference."""
         change = compare(self.plan, plan)
+        # Before the nodes, which refer to them.
         for definition in change.types:
             self._add_type(definition)
         for node in change.removed:
@@ -123,6 +124,7 @@ class PlantAddressSpace:
             node = self.plan.nodes.get(f"{station}/{name}")
             if isinstance(node, VariableNode) and not node.variable:
                 before = self._shown.get(node.node_id, (quality, 0))[1]
+                # The last known state stays, with a quality that says so.
                 shown = before if value is None else value
                 await self._show(node, Sample(shown, quality, now_ns))
 
@@ -132,6 +134,7 @@ class PlantAddressSpace:
         except (KeyError, TypeError):
             value = None  # not received yet, or the type has just changed
         shown = sample.quality, value
+        # asyncua calls monitored items back at every write, even of an equal value.
         if self._shown.get(node.node_id) == shown:
             return False
         self._shown[node.node_id] = shown
@@ -267,6 +270,7 @@ class PlantAddressSpace:
         self._add(node)
         self._space[node_id].references += below
         if value is not None:
+            # The attribute that was there is kept: the callbacks of monitored items hang at it.
             value.value = self._space[node_id].attributes[_A.Value].value
             self._space[node_id].attributes[_A.Value] = value
 
@@ -553,4 +557,5 @@ def _with_part(whole: Any, path: tuple[str, ...], plain: Any) -> Any:
         return plain
     if not isinstance(whole, Mapping):
         return whole
+    # A copy: what is shown is compared with what comes next.
     return {**whole, path[0]: _with_part(whole.get(path[0]), path[1:], plain)}
