@@ -25,7 +25,8 @@ class Endpoint(NamedTuple):
         package: Package of Python that it needs, and how it is called there.
         window: Whether the sender waits for its receiver; otherwise frames may be lost.
         kind: Its kind in charts.
-        batch: Frames that a call of the raw loop in C moves; 0 for a receiver that never sleeps.
+        batch: Frames that a call of the raw loop in C moves; 0 for a receiver that never sleeps,
+            also one of ours.
     """
 
     name: str

@@ -27,6 +27,7 @@ SHAPE = Shape(1, 1, 600)
 OURS = Endpoint(
     "ours", "product_roles.publish_paced", "product_roles.subscribe_on_arrival", kind=BarKind.OURS
 )
+SPINNING = OURS._replace(name="ours with spin: true", batch=0)
 RAW = Endpoint(
     "the raw Python loop", "raw_roles.send_paced", "raw_roles.receive_stamps", kind=BarKind.LIMIT
 )
@@ -86,12 +87,18 @@ def figures_of(
         name.removeprefix("latency, "), "µs", bars, target * middle[RAW.name]
     )
     raw = results[RAW.name]
+    if SPINNING.name in results:
+        spinning = results[SPINNING.name]
+        ratio = median_ratio((a["p50"], b["p50"]) for a, b in zip(spinning, raw, strict=True))
+        detail = f"{_us(spinning, 'p50')} to {_us(raw, 'p50')} µs"
+        title = f"{name}: p50 {SPINNING.name}, ratio to {RAW.name}"
+        figures.append(report(title, f"{ratio:.2f} ({detail})", ratio))
     tails = ", ".join(f"{key} {_us(ours, key)} to {_us(raw, key)} µs" for key in ("p99", "max"))
     return [*figures, report(f"{name}: tails, ours to {RAW.name}", tails)]
 
 
 def _measure(link: Cable, settings: Settings) -> dict[str, list[dict[str, Any]]]:
-    ways = [way for way in (OURS, RAW, C, *PEERS) if not way.lacks()]
+    ways = [way for way in (OURS, SPINNING, RAW, C, *PEERS) if not way.lacks()]
     results: dict[str, list[dict[str, Any]]] = {way.name: [] for way in ways}
     for number in range(max(2, settings.rounds // 2 + 1)):
         for way in ways[:: -1 if number % 2 else 1]:

@@ -97,7 +97,8 @@ def subscribe_on_arrival(job: dict[str, Any]) -> None:
     shape, stop = Shape(**job["shape"]), Page(Path(job["page"])).words
     spec = subscribing(shape, job["interface"])
     with assemble(spec, Path(job["folder"]), job["interface"]) as made:
-        engine, ticker, latencies = Engine([made.station]), Ticker(), Latencies()
+        engine, latencies = Engine([made.station]), Latencies()
+        ticker = Ticker(spins=job["batch"] == 0)
         engine.drain_on_arrival([made.channel])
         ticker.register(made.channel.fileno())
         memory, get = made.file.image.memory, _STAMP.unpack_from

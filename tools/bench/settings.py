@@ -14,10 +14,10 @@ class Settings(msgspec.Struct, frozen=True):
     rounds: int = 5
     throughput_s: float = 0.6
     latency_s: float = 2.0
-    lateness_s: float = 8.0
-    solar_s: float = 25.0
+    lateness_s: float = 6.0
+    solar_s: float = 20.0
     search_s: float = 4.0
-    cycle_s: float = 25.0
+    cycle_s: float = 20.0
     micro_repeats: int = 7
     started: float = msgspec.field(default_factory=monotonic)
 
