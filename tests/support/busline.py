@@ -109,6 +109,14 @@ class Line:
         while self.now_ns < until_ns:
             self.step(until_ns)
 
+    def elapse_until(self, condition: Callable[[], object], limit_ns: int = 3_000 * MS) -> None:
+        """Run until *condition* holds, and a little longer, for what else may follow."""
+        until_ns = self.now_ns + limit_ns
+        while not condition():
+            assert self.now_ns < until_ns, "did not happen in time"
+            self.elapse(10 * MS)
+        self.elapse(50 * MS)
+
     def wait(self, task: Task, limit_ns: int = 60_000 * MS):
         """Run until *task* is done; return its result or raise its error."""
         until_ns = self.now_ns + limit_ns

@@ -115,8 +115,7 @@ def test_writes_are_repeated_after_a_restart(fault):
         unit.fail(0x0060)
         unit.device.al_state = AlState.INIT
         unit.esc.set_al_status(0x11, 0x0060)
-    line.elapse(2000 * MS)
-    assert unit.state is AlState.OP
+    line.elapse_until(lambda: unit.state is AlState.OP)
     assert line.written == [("PREOP", 0x8000, 1)]
 
 
@@ -133,8 +132,7 @@ def test_refused_write_leaves_the_slave_out_and_is_named():
     assert [each for each in faults(line) if "start-up write of 0x8002:00 in PS" in each]
     # It is tried again: a slave that takes the value later reaches OP.
     line.segment.slaves[0].device.dictionary.entry(0x8002, 0).maximum = None
-    line.elapse(2500 * MS)
-    assert line.segment.slaves[0].state is AlState.OP
+    line.elapse_until(lambda: line.segment.slaves[0].state is AlState.OP)
     assert line.core.cycle.is_full
 
 
@@ -183,8 +181,7 @@ def test_mapping_and_assignment_are_written_before_the_writes_of_ps():
     line.segment.switch(0, on=False)
     line.elapse(200 * MS)
     line.segment.switch(0, on=True)
-    line.elapse(2000 * MS)
-    assert line.segment.slaves[0].state is AlState.OP
+    line.elapse_until(lambda: line.segment.slaves[0].state is AlState.OP)
     assert line.segment.slaves[0].device.process_data.inputs.size == 2
 
 
