@@ -40,7 +40,12 @@ BUSES = f"""\
         kind: bus
         interface: sim://drive.yaml
         net_id: {HERE}.3.1
-      - {{name: bus1, kind: bus, interface: "sim://buttons.yaml", net_id: {HERE}.4.1}}
+      - name: bus1
+        kind: bus
+        interface: sim://buttons.yaml
+        net_id: {HERE}.4.1
+        # A busy machine stops the engine for longer than the 100 ms of the slave itself.
+        slaves: {{buttons: {{watchdog: {{process_data_ms: 5000}}}}}}
 """
 PLANT = f"""\
 plant: buses
@@ -343,9 +348,9 @@ def test_remote_slaves_are_in_init_when_their_bus_is_gone(works: Works) -> None:
 
 def test_third_bus_has_a_gateway_port_of_its_own(works: Works) -> None:
     before = works.undisturbed()
-    last = BUSES.splitlines()[-1]
+    last = BUSES[BUSES.index("      - name: bus1") :]
     third = last.replace("bus1", "bus2").replace(".4.1", ".5.1").replace("buttons", "drive")
-    works.write(PLANT.replace(last, f"{last}\n{third}"))
+    works.write(PLANT.replace(last, last + third))
     works.apply()
     works.wait_op("bus2")
     assert product(HERE, 34982) == 0x5621
