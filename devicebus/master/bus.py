@@ -16,7 +16,7 @@ from devicebus.master.lock import CycleLock
 from devicebus.master.mailboxes import Mailbox, MailboxArea, Unsolicited
 from devicebus.master.matching import ExpectedSlave
 from devicebus.master.pdo import ProcessDataChannel
-from devicebus.master.procedure import Runner, Task
+from devicebus.master.procedure import Alarm, Runner, Task
 from devicebus.master.ring import RING_INDEXES, Ring
 from devicebus.master.scan import FIRST_STATION, FoundSlave
 from devicebus.wire.alstatus import AlState
@@ -246,6 +246,8 @@ class BusState:
         reference: Station address of the slave whose clock the others follow.
         is_lost: True while no frame comes back, so that the state of every slave is unknown.
         needs_check: True after a faulty cycle: the watch reads the slaves' states soon.
+        alarm: Ends the pause of the watch.
+        earliest_check_ns: Time before which it is not to end.
         knows_lrw: True if the cycle uses LRW.
         probe_ns: Time of the next look at slaves that are not expected.
         strangers: Slaves that are plugged in, but not expected, in words.
@@ -279,6 +281,8 @@ class BusState:
         self.reference: int | None = None
         self.is_lost = False
         self.needs_check = False
+        self.alarm = Alarm()
+        self.earliest_check_ns = 0
         self.knows_lrw = False
         self.strangers: tuple[str, ...] = ()
         self.probe_ns = 0
@@ -370,9 +374,14 @@ class BusState:
     def _answering(self) -> list[BusSlave]:
         return [slave for slave in self.slaves.values() if not slave.is_lost]
 
+    def check_soon(self, now_ns: int) -> None:
+        """Have the watch read the states of the slaves soon."""
+        if not self.needs_check:
+            self.needs_check = True
+            self.alarm.ring(max(now_ns, self.earliest_check_ns))
+
     def _handle_ring_change(self, now_ns: int) -> None:
-        del now_ns
-        self.needs_check = True
+        self.check_soon(now_ns)
         self.changes.note()
         self.locate_cut()
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Generator, Sequence
+from functools import partial
 from itertools import count
 from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
@@ -91,10 +92,27 @@ class Task(Generic[T]):
             callback(self)
 
 
+class Alarm:
+    """Ends a pause before its time."""
+
+    def __init__(self) -> None:
+        self._hasten: Callable[[int], None] | None = None
+
+    def arm(self, hasten: Callable[[int], None]) -> None:
+        """Call *hasten* with the new end of the pause from now on; called by the runner."""
+        self._hasten = hasten
+
+    def ring(self, at_ns: int) -> None:
+        """End the pause at *at_ns*, unless it ends before."""
+        if self._hasten is not None:
+            self._hasten(at_ns)
+
+
 class Sleep(NamedTuple):
-    """Pause of a procedure."""
+    """Pause of a procedure, which *alarm* may shorten."""
 
     duration_ns: int
+    alarm: Alarm | None = None
 
 
 class StepReplies(NamedTuple):
@@ -215,7 +233,8 @@ class Runner:
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._sleeping: list[tuple[int, int, _Run]] = []
+        self._sleeping: list[tuple[int, int, _Run, int]] = []
+        """End, order, and number of the pause of a run; an earlier pause of it has ended."""
         self._number = count()
 
     def start(self, procedure: Procedure[T], now_ns: int, name: str = "a procedure") -> Task[T]:
@@ -227,35 +246,47 @@ class Runner:
 
     def next_timeout(self) -> int | None:
         """Return the end of the next pause."""
-        while self._sleeping and self._sleeping[0][2].task.is_done:
-            heapq.heappop(self._sleeping)
-        return self._sleeping[0][0] if self._sleeping else None
+        sleeping = self._sleeping
+        while sleeping and not sleeping[0][2].is_pausing(sleeping[0][3]):
+            heapq.heappop(sleeping)
+        return sleeping[0][0] if sleeping else None
 
     def handle_timeout(self, now_ns: int) -> None:
         """Resume the procedures whose pause has ended."""
         while self._sleeping and self._sleeping[0][0] <= now_ns:
-            _, _, run = heapq.heappop(self._sleeping)
-            if not run.task.is_done:
+            _, _, run, pause = heapq.heappop(self._sleeping)
+            if run.is_pausing(pause):
                 run.resume(StepReplies((), now_ns))
 
     def queue_step(self, run: _Run, step: Step, now_ns: int) -> None:
         """Queue the next step of a procedure."""
         if isinstance(step, Sleep):
-            self._link.end_quiet()  # it may not last until then
-            entry = (now_ns + step.duration_ns, next(self._number), run)
-            heapq.heappush(self._sleeping, entry)
+            run.pause += 1
+            self._pause(run, run.pause, now_ns + step.duration_ns)
+            if step.alarm is not None:
+                step.alarm.arm(partial(self._pause, run, run.pause))
         else:
             run.exchange = self._link.submit(step, run.handle_replies)
 
+    def _pause(self, run: _Run, pause: int, until_ns: int) -> None:
+        """Resume *run* at *until_ns*, unless its pause has ended before."""
+        self._link.end_quiet()  # the quiet time may not last until then
+        heapq.heappush(self._sleeping, (until_ns, next(self._number), run, pause))
+
 
 class _Run:
-    """Running procedure with its pending step."""
+    """Running procedure with its pending step.
 
-    __slots__ = ("_procedure", "_runner", "exchange", "task")
+    Attributes:
+        pause: Number of its last pause.
+    """
+
+    __slots__ = ("_procedure", "_runner", "exchange", "pause", "task")
 
     def __init__(self, procedure: Procedure[Any], runner: Runner) -> None:
         self.task: Task[Any]
         self.exchange: Exchange | None = None
+        self.pause = 0
         self._procedure = procedure
         self._runner = runner
 
@@ -268,8 +299,13 @@ class _Run:
         else:
             self.resume(StepReplies(outcome, now_ns))
 
+    def is_pausing(self, pause: int) -> bool:
+        """Return whether the pause with this number lasts."""
+        return pause == self.pause and not self.task.is_done
+
     def resume(self, answer: StepReplies) -> None:
         """Resume the procedure with the result of its step."""
+        self.pause += 1  # an alarm may have left another end of the same pause
         self.advance(lambda: self._procedure.send(answer), answer.now_ns)
 
     def advance(self, action: Callable[[], Step], now_ns: int) -> None:

@@ -92,13 +92,9 @@ def set_up_cycle(bus: BusState) -> None:
     layout = plan_image([slave.process_data for slave in slaves])
     knows_lrw = bus.settings.allow_lrw and all(slave.found.esc.knows_lrw for slave in slaves)
 
-    def on_fault(now_ns: int) -> None:
-        del now_ns
-        bus.needs_check = True
-
     bus.image = BusImage(layout)
     bus.knows_lrw = knows_lrw
-    bus.cycle = Cycle(bus.link, bus.image, on_fault, knows_lrw=knows_lrw)
+    bus.cycle = Cycle(bus.link, bus.image, bus.check_soon, knows_lrw=knows_lrw)
     bus.distribute_time(bus.reference)
 
 

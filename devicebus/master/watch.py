@@ -127,7 +127,7 @@ def poll_error_counters(bus: BusState, log: PortErrorLog) -> Procedure[None]:
 PERIOD_NS = 100_000_000
 """Poll period of the AL status of all slaves without a fault."""
 SLICE_NS = 5_000_000
-"""Delay of the next poll after a faulty cycle."""
+"""Minimum time between two polls, the second of which follows a faulty cycle."""
 RETRY_NS = 1_000_000_000
 """Pause before the next attempt for a slave that could not be brought back."""
 _STATES = {int(state): state for state in AlState}
@@ -177,10 +177,9 @@ def _check_slaves(bus: BusState, replies: Sequence[DatagramReply], now_ns: int) 
 
 def _wait_for_period(bus: BusState) -> Procedure[int]:
     """Wait for the next poll; return the time."""
-    _, now_ns = yield Sleep(SLICE_NS)
-    end_ns = now_ns + PERIOD_NS - SLICE_NS
-    while now_ns < end_ns and not bus.needs_check:
-        _, now_ns = yield Sleep(SLICE_NS)
+    _, now_ns = yield Sleep(0)
+    bus.earliest_check_ns = now_ns + SLICE_NS
+    _, now_ns = yield Sleep(SLICE_NS if bus.needs_check else PERIOD_NS, bus.alarm)
     bus.needs_check = False
     return now_ns
 

@@ -188,6 +188,8 @@ class EngineBus:
     Attributes:
         is_simulated: Whether its slaves are a process of this appliance.
         is_up: Whether the bus has been brought up, in any state of its slaves.
+        listen: Called with whether frames that arrive are to be drained at once; in quiet cycles
+            the next cycle takes them, which saves a wake-up for each.
         refused: Slaves that were found, but are not as configured; empty without that fault.
         tasks: Requests that are under way.
     """
@@ -210,6 +212,8 @@ class EngineBus:
         self.is_up = False
         self.refused: Sequence[FoundSlave] = ()
         self.tasks: set[Task[Any]] = set()
+        self.listen: Callable[[bool], None] | None = None
+        self._is_listening = True
         self._settings = settings
         self._is_slow = cycle_ns > _LONG_CYCLE_NS
         self._mapping = BusMapping(spec, image, memory_of)
@@ -423,6 +427,7 @@ class EngineBus:
         frame = self.master.quiet_frame(now_ns) if is_quiet else None
         if frame is not None:
             self._send_frame(self._port, frame)
+            self._set_listening(is_on=False)
         else:
             self.master.start_cycle(now_ns)
             self._send(now_ns)
@@ -449,7 +454,11 @@ class EngineBus:
 
     def _receive_line(self, port: BusPort, line: RingEnd, now_ns: int) -> None:
         for _ in range(BATCH):
-            frame = self._receive_frame(port)
+            if self._is_listening:
+                frame = self._receive_frame(port)
+            else:
+                # It has waited for this cycle: its round trip ended when it arrived.
+                frame, now_ns = self._receive_stamped(port, now_ns)
             if frame is None:
                 break
             self.master.receive_frame(frame, now_ns, line)
@@ -464,8 +473,23 @@ class EngineBus:
             self._wire_faults[port] = str(exc)
             return None
 
+    def _receive_stamped(self, port: BusPort, now_ns: int) -> tuple[bytes | None, int]:
+        try:
+            return port.receive_stamped() or (None, now_ns)
+        except EnvironmentalError as exc:
+            self._wire_faults[port] = str(exc)
+            return None, now_ns
+
+    def _set_listening(self, *, is_on: bool) -> None:
+        if is_on is not self._is_listening and self.listen is not None:
+            self._is_listening = is_on
+            self.listen(is_on)
+
     def _send(self, now_ns: int) -> None:
-        for frame in self.master.frames_to_send(now_ns):
+        frames = self.master.frames_to_send(now_ns)
+        if frames:
+            self._set_listening(is_on=True)
+        for frame in frames:
             self._send_frame(self._port, frame)
         if self._second is not None:
             for frame in self.master.take_copies():

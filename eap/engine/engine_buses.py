@@ -11,6 +11,7 @@ import select
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple, Protocol
 
 from devicebus.master.procedure import Task
@@ -229,9 +230,18 @@ class EngineBuses:
         self._running[bus] = row
         entry.buses[port] = bus
         self._arrivals.update((fd, bus.drain) for fd in bus.filenos())
+        bus.listen = partial(self._listen, bus)
         if self.requests is not None:
             self.requests.add(row.number, bus)
         return row
+
+    def _listen(self, bus: EngineBus, is_on: bool) -> None:
+        for fd in bus.filenos():
+            if is_on:
+                self._arrivals[fd] = bus.drain
+            else:
+                self._arrivals.pop(fd, None)
+        self._notify()
 
     def _remove(self, entry: StationBuses, bus: EngineBus, now_ns: int) -> None:
         row = self._running.pop(bus)
@@ -254,7 +264,7 @@ class EngineBuses:
         self._engine.run_also([each.row.bus for each in self._leaving])
         for each in left:
             for fd in each.row.bus.filenos():
-                del self._arrivals[fd]
+                self._arrivals.pop(fd, None)
         self._notify()
         for each in left:
             each.row.bus.close()

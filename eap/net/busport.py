@@ -13,6 +13,7 @@ import errno
 import os
 import socket
 import struct
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
@@ -21,6 +22,7 @@ from eap.codec.ethercat import EAP_PORT, ETHERTYPE
 from eap.errors import EnvironmentalError
 from eap.ids import InterfaceUri, MacAddr
 from eap.net.ipsocket import bind_failure
+from eap.net.mmsg import SO_TIMESTAMPNS
 from eap.net.packetsocket import join_type1, open_type1
 
 BUS_MULTICAST_MAC = MacAddr.parse("01:01:05:01:00:00")
@@ -31,6 +33,9 @@ _PROCESSED = 0x02
 _LARGEST = 2048
 # Not every driver pads a short frame of a packet socket (IEEE 802.3: 60 bytes without FCS).
 _MINIMUM = 60
+_STAMP = struct.Struct("qq")
+_CONTROL_SIZE = socket.CMSG_SPACE(_STAMP.size)
+_BILLION = 1_000_000_000
 _LOST = (BlockingIOError, ConnectionRefusedError)
 
 
@@ -58,7 +63,9 @@ class BusPort:
             self._interface = interface or bound[0]
             # The interface may have been deleted while this process did not run.
             self._header = _ethernet_header(source or bound[4] or _made_up_address())
+        self._own_source = _source(self._header) if self._header else b""
         sock.setblocking(False)
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
 
     @property
     def source(self) -> bytes:
@@ -106,14 +113,42 @@ class BusPort:
                 return None
             except OSError as error:
                 raise EnvironmentalError(f"the bus cannot be reached: {error.strerror}") from None
-            if self._header:
-                # Without bit 1, which the first slave sets (ETG.1000.4) and some emulators do not.
-                if len(data) <= _HEADER or _source(data) != _source(self._header):
-                    continue
-                data = data[_HEADER:]
-            if data and self.tap is not None:
-                self.tap(data, False)
-            return data or None
+            if (frame := self._frame_in(data)) is not None:
+                return frame or None
+
+    def receive_stamped(self) -> tuple[bytes, int] | None:
+        """Return the next frame and when it arrived, maybe long ago; raises as receive().
+
+        The time is that of the monotonic clock, as the kernel noted it.
+        """
+        while True:
+            try:
+                data, ancillary, _, _ = self._sock.recvmsg(_LARGEST, _CONTROL_SIZE)
+            except _LOST:
+                return None
+            except OSError as error:
+                raise EnvironmentalError(f"the bus cannot be reached: {error.strerror}") from None
+            if (frame := self._frame_in(data)) is not None:
+                break
+        now_ns = time.monotonic_ns()
+        at_ns = now_ns
+        for _, kind, stamp in ancillary:
+            if kind == SO_TIMESTAMPNS:
+                # It is by the clock of the host, which may have been set since.
+                seconds, rest = _STAMP.unpack(stamp)
+                at_ns = min(seconds * _BILLION + rest + now_ns - time.time_ns(), now_ns)
+        return (frame, at_ns) if frame else None
+
+    def _frame_in(self, data: bytes) -> bytes | None:
+        """Return the frame that was received from its EtherCAT header on, None if not for us."""
+        if self._header:
+            # Without bit 1, which the first slave sets (ETG.1000.4) and some emulators do not.
+            if len(data) <= _HEADER or _source(data) != self._own_source:
+                return None
+            data = data[_HEADER:]
+        if data and self.tap is not None:
+            self.tap(data, False)
+        return data
 
     def _join_again(self) -> None:
         """Find the interface that was taken away, if another of its name has come."""

@@ -93,6 +93,13 @@ class Wire:
             return self._back.popleft()[1]
         return None
 
+    def receive_stamped(self) -> tuple[bytes, int] | None:
+        self.settle()
+        if self._back and self._back[0][0] <= self.now_ns:
+            at_ns, frame = self._back.popleft()
+            return frame, at_ns
+        return None
+
     def settle(self) -> int | None:
         """Let the segment work; return when the next frame is back."""
         self.segment.handle_timeout(self.now_ns)
@@ -114,6 +121,8 @@ class BusRig:
         self.now_ns = 1_000 * MS
         self.cycle_ns = 1000 * self.station.cycle_us
         self._next_ns = self.now_ns
+        self.is_listening = True
+        self.changes = 0
         port = self.station.ports[1]
         self.bus = EngineBus(
             port,
@@ -123,6 +132,12 @@ class BusRig:
             self.memory_of,
             self.wire,
         )
+        self.bus.listen = self._listen
+
+    def _listen(self, is_on: bool) -> None:
+        assert is_on is not self.is_listening
+        self.is_listening = is_on
+        self.changes += 1
 
     def memory_of(self, writer: Writer) -> memoryview:
         return self.image.memory if writer is Writer.ENGINE else self.application
@@ -140,10 +155,13 @@ class BusRig:
 
     def step(self, until_ns: int) -> None:
         """Go to whatever comes next, at most to *until_ns*."""
-        times = [until_ns, self._next_ns, self.bus.next_timeout(), self.wire.settle()]
+        back_ns = self.wire.settle()
+        times = [until_ns, self._next_ns, self.bus.next_timeout()]
+        times += [back_ns] if self.is_listening else []
         self.now_ns = max(self.now_ns, min(at for at in times if at is not None))
         self.wire.now_ns = self.now_ns
-        self.bus.drain(self.now_ns)
+        if self.is_listening:
+            self.bus.drain(self.now_ns)
         due_ns = self.bus.next_timeout()
         if due_ns is not None and due_ns <= self.now_ns:
             self.bus.handle_timeout(self.now_ns)

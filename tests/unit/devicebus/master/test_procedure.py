@@ -6,9 +6,9 @@ import pytest
 
 from devicebus.errors import BusError, FrameLostError, WorkingCounterError
 from devicebus.master.link import BACKOFF_LIMIT_NS, RETRIES
-from devicebus.master.procedure import Sleep, StepReplies, Task, read, together, write
+from devicebus.master.procedure import Alarm, Sleep, StepReplies, Task, read, together, write
 from devicebus.wire.datagram import DatagramReply, fprd, fpwr
-from tests.support.busline import Bench, answer
+from tests.support.busline import MS, Bench, answer
 
 
 @pytest.fixture
@@ -223,3 +223,28 @@ def test_runner_cancelled_procedure_sends_nothing_more(bench, asleep):
     assert bench.next_timeout() is None
     bench.handle_timeout(10)
     assert bench.frames_to_send(10) == []
+
+
+def test_alarm_ends_a_pause_once():
+    bench = Bench()
+    alarm, woken = Alarm(), []
+
+    def procedure():
+        for pause_ns in (100 * MS, 50 * MS):
+            _, now_ns = yield Sleep(pause_ns, alarm)
+            woken.append(now_ns)
+
+    alarm.ring(5)
+    task = bench.runner.start(procedure(), 0)
+    alarm.ring(300 * MS)
+    assert bench.next_timeout() == 100 * MS
+    alarm.ring(20 * MS)
+    assert bench.next_timeout() == 20 * MS
+    bench.handle_timeout(20 * MS)
+    assert (woken, bench.next_timeout()) == ([20 * MS], 70 * MS)
+    bench.handle_timeout(70 * MS)
+    assert (woken, task.is_done) == ([20 * MS, 70 * MS], True)
+    alarm.ring(80 * MS)
+    assert bench.next_timeout() is None
+    bench.handle_timeout(400 * MS)
+    assert woken == [20 * MS, 70 * MS]

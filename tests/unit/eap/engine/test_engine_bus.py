@@ -6,13 +6,16 @@ import msgspec
 import pytest
 
 from devicebus.master.master import Master
+from devicebus.master.procedure import read
 from devicebus.wire.alstatus import AlState
+from devicebus.wire.register import Register
+from eap.compiled import cyclic
 from eap.engine.bus_report import report_bus
 from eap.engine.engine_bus import RETRY_NS, SILENT_RETRY_NS
 from eap.pd.spec import BusTarget
 from eap.runtime.bus_status import is_silent
 from tests.support.cyclic import MS
-from tests.support.enginebus import BUS, BusRig
+from tests.support.enginebus import BUS, TRIP_NS, BusRig
 from tests.support.terminals import write_bus
 
 
@@ -262,3 +265,27 @@ def test_engine_bus_terminals_of_one_bit_pdos_share_a_byte_in_the_image(tmp_path
     rig.set("bus0.do8.Channel_6.Signal", True)
     rig.run(5 * MS)
     assert rig.wire.segment.segment.slaves[2].device.process_data.outputs.pack() == b"\x20"
+
+
+def test_replies_of_quiet_cycles_wait_for_the_next_cycle(rig):
+    rig.run(50 * MS)
+    before, changes = rig.bus.master.cycle.stats(), rig.changes
+    rig.run(300 * MS)
+    after = rig.bus.master.cycle.stats()
+    assert after.good - before.good == after.cycles - before.cycles > 290
+    # The round trip ends when the frame arrives, not when it is taken.
+    assert after.trip_ns == after.max_trip_ns == TRIP_NS
+    if cyclic is None:
+        assert rig.is_listening
+    else:
+        assert 0 < rig.changes - changes < 60
+
+
+def test_requests_are_not_kept_waiting_by_quiet_cycles(rig):
+    rig.run(55 * MS)
+    begun_ns = rig.now_ns
+    task = rig.bus.master.run(read(1001, Register.TYPE, 1), begun_ns)
+    rig.bus.keep(task, begun_ns)
+    assert rig.is_listening
+    rig.wait(lambda: task.is_done)
+    assert rig.now_ns - begun_ns == TRIP_NS

@@ -207,13 +207,14 @@ def test_removed_bus_goes_to_init_and_refuses_requests(start_plant):
     running = start_plant()
     running.run_until(lambda: running.value("bus0.state") == AlState.OP)
     assert running.ask(DescribeBus(id=101, bus=1)).report.is_up
-    before = len(running.plant.arrivals)
+    (bus,) = running.plant.buses._running
     assert running.configure() is None
     assert "bus0.state" not in running.plant.image("one").slots
     running.run_until(lambda: running.slaves[0].states() == [AlState.INIT] * 3)
     error = running.ask(DescribeBus(id=102, bus=1)).error
     assert "there is no bus 1" in error.message
-    running.run_until(lambda: len(running.plant.arrivals) < before)
+    running.run_until(lambda: bus.filenos() == [-1])
+    assert bus.drain not in running.plant.arrivals.values()
 
 
 def test_added_bus_is_brought_up_beside_the_other(start_plant):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import select
 import socket
+import time
 
 import pytest
 
@@ -59,6 +60,19 @@ def pair():
 
 def test_pair(pair):
     assert exchange(*pair) == FRAME[:2] + b"\x08" + FRAME[3:]
+
+
+def test_stamp_is_the_time_of_arrival(pair):
+    master, far = pair
+    assert master.receive_stamped() is None
+    begun_ns = time.monotonic_ns()
+    far.send(bytearray(FRAME), b"")
+    sent_ns = time.monotonic_ns()
+    select.select([], [], [], 0.02)
+    frame, at_ns = master.receive_stamped()
+    assert frame == FRAME
+    # The clock of the host is read beside the monotonic one, and may be corrected meanwhile.
+    assert begun_ns - 1_000_000 < at_ns < sent_ns + 10_000_000
 
 
 def test_tap_of_a_bus_port_sees_what_is_sent_and_received(pair):
