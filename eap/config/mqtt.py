@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 from msgspec.structs import replace
@@ -13,7 +12,7 @@ from eap.config.bridge_sections import MqttBridgeSpec, MqttSection
 from eap.config.brokers import URL, broker_spec, brokers_of, check_credentials, parse_url
 from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
-from eap.config.selection import VariableNames, reason_not_settable
+from eap.config.selection import VariableNames, paths_of, reason_not_settable
 from eap.config.structs import RouteSection, StationSection
 from eap.patterns import match_names
 from eap.suggest import suggest
@@ -65,7 +64,7 @@ def check_mqtt(index: Index, report: FindingReport, folder: Path) -> None:
     _check_topic(section, report)
     names = VariableNames(index, report)
     for each in section.publish:
-        for path, pattern in _paths_of(each.of, f"{each.at}.of" if each.at else section.at):
+        for path, pattern in paths_of(each.of, f"{each.at}.of" if each.at else section.at):
             names.check_pattern(path, pattern)
         if 0 < each.every_ms < section.period_ms:
             message = f"every_ms is {each.every_ms}, and values are read every {section.period_ms}"
@@ -166,10 +165,3 @@ def _check_settable(
 
 def _is_level(text: str) -> bool:
     return bool(text) and text.isprintable() and not set(text) & set("+#/ ")
-
-
-def _paths_of(of: str | tuple[str, ...], at: str) -> Iterator[tuple[str, str]]:
-    if isinstance(of, str):
-        yield at, of
-    else:
-        yield from ((f"{at}[{position}]", name) for position, name in enumerate(of))

@@ -97,3 +97,11 @@ def reason_not_settable(index: Index, station: StationSection, name: str) -> str
         return "it is the state of a controller"
     is_received = variable in names and variable not in station.variables
     return "it is received" if is_received else ""
+
+
+def paths_of(of: str | tuple[str, ...], at: str) -> Iterator[tuple[str, str]]:
+    """Yield each name of a key that has one or a list, behind its path in the file."""
+    if isinstance(of, str):
+        yield at, of
+    else:
+        yield from ((f"{at}[{position}]", name) for position, name in enumerate(of))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from ipaddress import ip_network
 from pathlib import Path
 from typing import TypeVar
@@ -17,7 +17,7 @@ from eap.config.finding import FindingReport, PlantFinding, one_of
 from eap.config.index import Index
 from eap.config.listen import parse_listen
 from eap.config.pictures import read_picture
-from eap.config.selection import VariableNames, reason_not_settable
+from eap.config.selection import VariableNames, paths_of, reason_not_settable
 from eap.config.structs import StationSection
 from eap.config.users import check_users
 from eap.config.web_sections import (
@@ -276,7 +276,7 @@ class _PanelCheck:
         panel: ValuePanel | TablePanel | StatesPanel | TrendPanel,
         more: Sequence[str] = (),
     ) -> None:
-        for path, name in _paths_of(panel.of, f"{panel.at}.of"):
+        for path, name in paths_of(panel.of, f"{panel.at}.of"):
             self._variables.check_pattern(path, name, more)
 
     def _check_patterns(
@@ -288,7 +288,7 @@ class _PanelCheck:
     ) -> None:
         names = list(known)
         is_default = panel.of in {"*", "*/*"}
-        for path, name in _paths_of(panel.of, f"{panel.at}.of"):
+        for path, name in paths_of(panel.of, f"{panel.at}.of"):
             if not is_default and not match_names(name, names):
                 hint = "" if "*" in name else suggest(name, names)
                 message = f"unknown {noun} {name!r}{hint}"
@@ -349,13 +349,6 @@ class _PanelCheck:
             elif ids is not None and selector[1:] not in ids:
                 message = f"{panel.file} has no element {selector!r}{suggest(selector[1:], ids)}"
                 self._report.add(path, message, one_of(sorted(ids)[:12]))
-
-
-def _paths_of(of: str | tuple[str, ...], at: str) -> Iterator[tuple[str, str]]:
-    if isinstance(of, str):
-        yield at, of
-    else:
-        yield from ((f"{at}[{position}]", name) for position, name in enumerate(of))
 
 
 def _is_number(index: Index, station: StationSection, name: str) -> bool:

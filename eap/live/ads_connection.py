@@ -67,9 +67,8 @@ from eap.control.protocol import (
 )
 from eap.errors import CodecError, ControlError
 from eap.ids import NetId
-from eap.live.transport import ValuesSubscription, end_requests, gone
+from eap.live.transport import StreamConnection, ValuesSubscription, gone
 from eap.ops.client import checked
-from eap.services.tasks import TaskSet
 
 CONNECT_S = 3.0
 """Time for a connection."""
@@ -105,7 +104,7 @@ class RemoteHost(NamedTuple):
         return self.host if self.net_id is None else f"{self.host}:{self.net_id}"
 
 
-class AdsConnection:
+class AdsConnection(StreamConnection[AmsAnswer]):
     """The appliance of a remote station (PlantConnection).
 
     Args:
@@ -122,18 +121,13 @@ class AdsConnection:
         target: NetId,
         source: NetId,
     ) -> None:
-        self._reader = reader
-        self._writer = writer
+        super().__init__(reader, writer, "ADS connection")
         self._target = target
         self._source = source
         # All clients of this host have one NetID: a router tells them apart by their ports.
         self._source_port = _FIRST_PORT + randbelow(_FIRST_PORT)
         self._numbers = count(1)
-        self._waiting: dict[int, asyncio.Future[AmsAnswer]] = {}
         self._ports: dict[str, NetId] = {}
-        self._error: ControlError | None = None
-        self._tasks = TaskSet("ADS connection")
-        self._tasks.start(self._receive())
 
     @classmethod
     async def open(cls, address: RemoteHost) -> Self:
@@ -218,14 +212,6 @@ class AdsConnection:
                     yield ValuesEvent(**asdict(found) | changed, skipped=skipped)
             due_s = max(due_s + wanted.period_ms / 1000, clock())
             await asyncio.sleep(due_s - clock())
-
-    async def close(self) -> None:
-        """Close it; what waits gets ControlError."""
-        await self._tasks.close()
-        self._end("the connection was closed")
-        self._writer.close()
-        with suppress(OSError):
-            await self._writer.wait_closed()
 
     async def _rest(self, ticket: int, position: int) -> tuple[bytes, AnswerPart]:
         wanted = PartRequest(ticket, position).encode()
@@ -320,12 +306,6 @@ class AdsConnection:
         except (OSError, CodecError) as exc:
             why = f"the connection to the router broke: {exc}"
         self._end(why)
-
-    def _end(self, why: str) -> None:
-        if self._error is not None:
-            return
-        self._error = gone(why)
-        end_requests(self._waiting.values(), self._error)
 
 
 def _refused(result: int, what: str) -> ControlError:

@@ -6,10 +6,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Iterable
+from abc import ABC, abstractmethod
+from collections.abc import AsyncGenerator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import msgspec
 from msgspec.structs import replace
@@ -75,29 +76,61 @@ def gone(why: str) -> ControlError:
     return ControlError(why, code=ErrorCode.UNAVAILABLE)
 
 
-def end_requests(answers: Iterable[asyncio.Future[Any]], error: ControlError) -> None:
-    """Raise *error* in all requests that wait for *answers*."""
-    for answer in answers:
-        if not answer.done():
-            answer.set_exception(error)
-            answer.exception()  # so that asyncio does not miss a requester just cancelled
+AnswerT = TypeVar("AnswerT")
 
 
-class UnixConnection:
+class StreamConnection(ABC, Generic[AnswerT]):
+    """Base of connections by a stream whose requests and answers have numbers.
+
+    Args:
+        reader: Of the stream.
+        writer: Of the same.
+        name: Of the task that receives.
+    """
+
+    def __init__(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, name: str
+    ) -> None:
+        self._reader = reader
+        self._writer = writer
+        self._waiting: dict[int, asyncio.Future[AnswerT]] = {}
+        self._error: ControlError | None = None
+        self._tasks = TaskSet(name)
+        self._tasks.start(self._receive())
+
+    async def close(self) -> None:
+        """Close it; what waits gets ControlError."""
+        await self._tasks.close()
+        self._end("the connection was closed")
+        self._writer.close()
+        with suppress(OSError):
+            await self._writer.wait_closed()
+
+    @abstractmethod
+    async def _receive(self) -> None:
+        """Take answers until the stream ends."""
+
+    def _end(self, why: str) -> None:
+        """Raise an error in all requests that wait, and in later ones."""
+        if self._error is not None:
+            return
+        self._error = gone(why)
+        for answer in self._waiting.values():
+            if not answer.done():
+                answer.set_exception(self._error)
+                answer.exception()  # so that asyncio does not miss a requester just cancelled
+
+
+class UnixConnection(StreamConnection[ControlReply]):
     """The control socket of one appliance (PlantConnection).
 
     Requests are answered in their order; several may be under way.
     """
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._reader = reader
-        self._writer = writer
+        super().__init__(reader, writer, "control connection")
         self._last_id = 0
-        self._waiting: dict[int, asyncio.Future[ControlReply]] = {}
         self._watches: dict[int, _LatestValues] = {}
-        self._error: ControlError | None = None
-        self._tasks = TaskSet("control connection")
-        self._tasks.start(self._receive())
 
     @classmethod
     async def open(cls, path: Path) -> Self:
@@ -126,14 +159,6 @@ class UnixConnection:
                 with suppress(ControlError):
                     await self._request("unsubscribe", {"subscription": number})
             del self._watches[number]  # not earlier: events come until the answer
-
-    async def close(self) -> None:
-        """Close it; what waits gets ControlError."""
-        await self._tasks.close()
-        self._end("the connection was closed")
-        self._writer.close()
-        with suppress(OSError):
-            await self._writer.wait_closed()
 
     async def _request(self, method: str, params: dict[str, Any]) -> ControlReply:
         if self._error is not None:
@@ -174,12 +199,9 @@ class UnixConnection:
             answer.set_result(reply)
 
     def _end(self, why: str) -> None:
-        if self._error is not None:
-            return
-        self._error = gone(why)
-        end_requests(self._waiting.values(), self._error)
+        super()._end(why)
         for watch in self._watches.values():
-            watch.end(self._error)
+            watch.end(self._error or gone(why))
 
 
 class _LatestValues:

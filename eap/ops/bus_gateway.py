@@ -30,7 +30,7 @@ from eap.gateway.error_table import Cause
 from eap.gateway.requests import ALL_SLAVES, MASTER_ADDRESS, VIRTUAL_BIT, address_text
 from eap.gateway.slaves import NO_DICTIONARY, MasterSlave
 from eap.od.abort import AbortCode, SdoAbortError
-from eap.ops.bus_session import Begin, Slave, SlaveBus, choose, no_mailbox
+from eap.ops.bus_session import Begin, Slave, SlaveBus, choose, no_mailbox, slave_number
 from eap.runtime.bus_status import FrameCounts
 
 T = TypeVar("T")
@@ -84,7 +84,7 @@ class GatewayBus(SlaveBus):
         """
         if name in {"0", "master"}:
             return _slave(_unknown(MASTER_ADDRESS, "master"))
-        number = _number(name)
+        number = slave_number(name)
         if number == ALL_SLAVES:
             raise ConfigError(f"{name} addresses all slaves: name one slave")
         if number < 0:
@@ -225,13 +225,6 @@ def _is_too_long(error: EapError) -> bool:
         or (isinstance(error, MailboxRefusedError) and error.detail == MailboxError.INVALID_SIZE)
         or (isinstance(error, SoeError) and error.code == SoeErrorCode.VALUE_TOO_LONG)
     )
-
-
-def _number(text: str) -> int:
-    try:
-        return int(text, 0)
-    except ValueError:
-        return -1
 
 
 def _slave(slave: MasterSlave) -> Slave:

@@ -376,7 +376,7 @@ def choose(slaves: Sequence[Slave], name: str) -> Slave:
         BusError: there is none, or several have that name.
     """
     if name.isdecimal() or name.lower().startswith("0x"):
-        fitting = [slave for slave in slaves if slave.station == _number(name)]
+        fitting = [slave for slave in slaves if slave.station == slave_number(name)]
     else:
         fitting = [slave for slave in slaves if slave.name == name]
     if len(fitting) == 1:
@@ -398,7 +398,8 @@ def no_mailbox(slave: Slave, state: str) -> BusError:
     )
 
 
-def _number(text: str) -> int:
+def slave_number(text: str) -> int:
+    """Return the number that names a slave; -1 for what is none."""
     try:
         return int(text, 0)
     except ValueError:
