@@ -10,7 +10,7 @@ import argparse
 import importlib
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -38,7 +38,6 @@ NAMES = (
     "routing", "ads", "gateway", "files", "startup", "acyclic", "cycle", "plantbus", "recovery",
     "segment",
 )  # fmt: skip
-_FAILURES = (RuntimeError, subprocess.SubprocessError)
 PAGE = ROOT / "docs" / "performance.md"
 QUIET = ("latency", "lateness", "solar", "limits", "demo", "startup")
 """Benchmarks whose figures are no ratios, or medians of wake-ups: other work changes them."""
@@ -70,14 +69,10 @@ class Report(msgspec.Struct, frozen=True):
 def main(arguments: list[str]) -> int:
     """Run the selected benchmarks; return 0 even when a target was missed."""
     options = _parse(arguments)
-    if options.read:
-        report = msgspec.json.decode(Path(options.read).read_bytes(), type=Report)
-    else:
-        report = _measure(options)
+    report = _read([Path(name) for name in options.read]) if options.read else _measure(options)
     print(f"\n{TARGETS}\n{text_table(report.targets, limits=True)}\n{REMARK}")
     if options.json:
-        data = msgspec.json.encode(report)
-        Path(options.json).write_bytes(msgspec.json.format(data) + b"\n")
+        _save(Path(options.json), report)
     if options.markdown:
         _write_page(report, _write_charts(PICTURES, report))
     if options.charts:
@@ -91,19 +86,37 @@ def _measure(options: Any) -> Report:
     settings = quick() if options.quick else Settings()
     about = machine.describe()
     print(about)
-    sections = []
+    report = Report(about, options.quick, [], [])
     for name in options.names or NAMES:
         section = _run(name, settings)
-        sections.append(section)
+        sections = [*report.sections, section]
+        report = replace(report, targets=_targets(sections), sections=sections)
+        if options.json:  # a run that is ended keeps what it has
+            _save(Path(options.json), report)
         settings.tell(f"{name} took {section.seconds:.0f} s")
         print(f"\n{section.title}\n{text_table(section.figures)}", flush=True)
-    targets = [
+    return report
+
+
+def _save(path: Path, report: Report) -> None:
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(report)) + b"\n")
+
+
+def _read(paths: Sequence[Path]) -> Report:
+    """Return the report of the first file, with the sections that others measured again."""
+    first, *others = (msgspec.json.decode(path.read_bytes(), type=Report) for path in paths)
+    sections = {section.name: section for each in (first, *others) for section in each.sections}
+    return replace(first, targets=_targets(sections.values()), sections=[*sections.values()])
+
+
+def _targets(sections: Iterable[Section]) -> list[Figure]:
+    """Return the figures that have a limit; the names of some end with the mark of REMARK."""
+    return [
         replace(figure, name=f"{figure.name} *") if section.name in QUIET else figure
         for section in sections
         for figure in section.figures
         if figure.limit
     ]
-    return Report(about, options.quick, targets, sections)
 
 
 def _parse(arguments: list[str]) -> Any:
@@ -114,7 +127,10 @@ def _parse(arguments: list[str]) -> Any:
     parser.add_argument("--markdown", action="store_true", help=f"put the tables into {PAGE.name}")
     parser.add_argument("--charts", metavar="FOLDER", help="draw charts of the figures there")
     parser.add_argument(
-        "--read", metavar="FILE", help="measure nothing: take the figures of --json"
+        "--read",
+        metavar="FILE",
+        nargs="+",
+        help="measure nothing: take the figures that --json wrote, of a benchmark the last ones",
     )
     options = parser.parse_args(arguments)
     if options.markdown and (options.names or options.quick):
@@ -128,38 +144,37 @@ def _parse(arguments: list[str]) -> Any:
 
 
 def _run(name: str, settings: Settings) -> Section:
-    module = importlib.import_module(f"tools.bench.{name}")
-    begin = monotonic()
+    title, begin = name, monotonic()
     try:
+        module = importlib.import_module(f"tools.bench.{name}")
+        title = module.TITLE
         figures = _try(module, settings)
     except SkippedError as reason:
         figures = [skipped(name, reason)]
-    except _FAILURES as error:
+    except ModuleNotFoundError as error:
+        figures = [skipped(name, f"needs {error.name}")]
+    except Exception as error:  # noqa: BLE001  the other benchmarks go on
         figures = [Figure(name, f"failed: {error}", decision=Decision.MISSED)]
-    return Section(name, module.TITLE, figures, round(monotonic() - begin, 1))
+    return Section(name, title, figures, round(monotonic() - begin, 1))
 
 
 def _try(module: Any, settings: Settings) -> list[Figure]:
     """Run a benchmark, once more if it fails: the machine may have stood still."""
     try:
         return list(module.run(settings))
-    except _FAILURES as error:
+    except (RuntimeError, subprocess.SubprocessError) as error:
         settings.tell(f"once more: {error}")
         return list(module.run(settings))
 
 
 def _write_page(report: Report, charts: Sequence[Chart]) -> None:
-    tables = [_shown(chart) for chart in charts]
-    tables += [f"### {TARGETS}\n\n{markdown_table(report.targets, limits=True)}\n\n{REMARK}"]
+    tables = [f"### {TARGETS}\n\n{markdown_table(report.targets, limits=True)}\n\n{REMARK}"]
+    tables += [f"![{chart.title}]({PICTURES.name}/{chart.file})" for chart in charts]
     tables += [f"### {s.title}\n\n{markdown_table(s.figures)}" for s in report.sections]
     made = f"Machine: {report.machine}. Made by `make bench ARGS=--markdown`."
     new = "\n\n".join([made, *tables])
     text = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(replace_between(text, BEGIN, END, f"\n{new}\n"), encoding="utf-8")
-
-
-def _shown(chart: Chart) -> str:
-    return f"![{chart.title}]({PICTURES.name}/{chart.file})"
 
 
 def _write_charts(folder: Path, report: Report) -> Sequence[Chart]:

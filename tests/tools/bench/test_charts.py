@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 from defusedxml.ElementTree import fromstring
+from msgspec.json import encode
+from msgspec.json import format as format_json
+from msgspec.structs import replace
 
 from tools.bench import __main__ as program
 from tools.bench.charts import CHARTS, draw, write_charts
@@ -61,9 +64,16 @@ def test_report_is_read_back_without_a_measurement(tmp_path: Path, capsys) -> No
     figure = Figure("frames", "1.1", limit="a C loop").compared("frames", "thousand/s", BARS)
     report = program.Report("here", False, [figure], [program.Section("bus", "Bus", [figure])])
     first, second = tmp_path / "first.json", tmp_path / "second.json"
-    first.write_bytes(program.msgspec.json.format(program.msgspec.json.encode(report)) + b"\n")
+    first.write_bytes(format_json(encode(report)) + b"\n")
+    newer = replace(report.sections[0], figures=[replace(figure, measured="1.2")])
+    again = tmp_path / "again.json"
+    again.write_bytes(encode(replace(report, sections=[newer])))
     words = ["--read", str(first), "--json", str(second), "--charts", str(tmp_path)]
     assert program.main(words) == 0
     assert second.read_bytes() == first.read_bytes()
     assert (tmp_path / "bench-bus.svg").exists()
+    words[1:2] = [str(first), str(again)]
+    assert program.main(words) == 0
+    assert b'"measured": "1.2"' in second.read_bytes()
+    assert b'"measured": "1.1"' not in second.read_bytes()
     assert "frames          1.1               a C loop" in capsys.readouterr().out
