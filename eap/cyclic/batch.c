@@ -108,7 +108,7 @@ static PyObject *receiver_new(PyTypeObject *type, PyObject *args, PyObject *keyw
         || PyObject_GetBuffer(control, &self->control, PyBUF_CONTIG)
         || (senders != Py_None && PyObject_GetBuffer(senders, &self->senders, PyBUF_CONTIG))
         || describe(self)) {
-        Py_DECREF(self);
+        Py_DECREF((PyObject *)self);
         return NULL;
     }
     return (PyObject *)self;
@@ -154,54 +154,52 @@ static int hand_over(Receiver *self, Py_ssize_t n, Py_ssize_t size, int64_t at_n
     return done == NULL ? -1 : 0;
 }
 
-/* ---- Drain: reading of one socket ---- */
+/* ---- Socket: reading of one socket, and who sends through it ---- */
 
-typedef struct {
-    PyObject_HEAD
-    PyObject *receiver, *handlers, *origin;
-    int fd;
-    char is_paused;
-} Drain;
-
-static int drain_clear(Drain *self) {
+static int socket_clear(Socket *self) {
     Py_CLEAR(self->handlers);
     return 0;
 }
 
-static int drain_traverse(Drain *self, visitproc visit, void *arg) {
+static int socket_traverse(Socket *self, visitproc visit, void *arg) {
     Py_VISIT(Py_TYPE((PyObject *)self));
     Py_VISIT(self->handlers);
     return 0;
 }
 
-static void drain_dealloc(Drain *self) {
+static void socket_dealloc(Socket *self) {
     PyObject_GC_UnTrack(self);
-    drain_clear(self);
+    socket_clear(self);
     Py_XDECREF(self->receiver);
     Py_XDECREF(self->origin);
+    Py_XDECREF(self->sender);
     free_object((PyObject *)self);
 }
 
-/* Drain(receiver, fd, handlers, origin): *handlers* is a list, or those of a packet socket by VLAN
-   and address.  To *origin*, of which only a weak reference is kept, the frames are said to belong;
-   its drain() is called while is_paused.  */
-static PyObject *drain_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
-    PyObject *receiver, *handlers, *origin;
+/* Socket(receiver, fd, handlers, origin, sender): *handlers* is a list, or those of a packet socket
+   by VLAN and address.  To *origin*, of which only a weak reference is kept, the frames are said to
+   belong; its drain() is called unless may_drain.  *sender* is its SendBatch.  */
+static PyObject *socket_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
+    PyObject *receiver, *handlers, *origin, *sender;
     int fd;
-    if (!PyArg_ParseTuple(args, "O!iOO", receiver_type, &receiver, &fd, &handlers, &origin))
+    if (!PyArg_ParseTuple(args, "O!iOOO", receiver_type, &receiver, &fd, &handlers, &origin,
+                          &sender))
         return NULL;
     const Receiver *batch = (Receiver *)receiver;
     if (PyDict_Check(handlers) ? batch->control_size < TAG_AT + 2
                                : !PyList_Check(handlers) || batch->senders.buf == NULL)
         return PyErr_Format(PyExc_TypeError, "a list of handlers, or routes of a packet socket");
-    Drain *self = (Drain *)make_object(type, keywords);
+    Socket *self = (Socket *)make_object(type, keywords);
     if (self == NULL)
         return NULL;
     Py_INCREF(receiver);
     self->receiver = receiver;
     Py_INCREF(handlers);
     self->handlers = handlers;
+    Py_INCREF(sender);
+    self->sender = sender;
     self->fd = fd;
+    self->may_drain = self->may_send = 1;
     if ((self->origin = PyWeakref_NewRef(origin, NULL)) == NULL)
         Py_CLEAR(self);
     return (PyObject *)self;
@@ -291,17 +289,16 @@ static Py_ssize_t receive_batches(Receiver *self, int fd, PyObject *handlers, Py
     return total;
 }
 
-Py_ssize_t drain(PyObject *object) {
-    Drain *self = (Drain *)object;
+Py_ssize_t drain(Socket *self) {
     Receiver *receiver = (Receiver *)self->receiver;
     PyObject *origin = PyWeakref_GetObject(self->origin), *handlers = self->handlers;
     if (origin == Py_None || handlers == NULL)
         return 0;
     Py_ssize_t total = -1;
-    Py_INCREF(object);
+    Py_INCREF((PyObject *)self);
     Py_INCREF(origin);
     Py_INCREF(handlers);
-    if (self->is_paused) {
+    if (!self->may_drain) {
         PyObject *count = PyObject_CallMethod(origin, "drain", NULL);
         total = count == NULL ? -1 : PyLong_AsSsize_t(count);
         Py_XDECREF(count);
@@ -314,12 +311,12 @@ Py_ssize_t drain(PyObject *object) {
     }
     Py_DECREF(handlers);
     Py_DECREF(origin);
-    Py_DECREF(object);
+    Py_DECREF((PyObject *)self);
     return total;
 }
 
-/* drain(now_ns) */
-static PyObject *drain_call(PyObject *self, PyObject *args, PyObject *keywords) {
+/* socket(now_ns) */
+static PyObject *socket_call(Socket *self, PyObject *args, PyObject *keywords) {
     (void)args;
     (void)keywords;
     Py_ssize_t total = drain(self);
@@ -333,16 +330,17 @@ PyType_Spec receiver_spec = {
     "eap._cyclic.Receiver", sizeof(Receiver), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_IMMUTABLETYPE,
     receiver_slots,
 };
-static PyMemberDef drain_members[] = {
-    {"is_paused", T_BOOL, offsetof(Drain, is_paused), 0, NULL},
+static PyMemberDef socket_members[] = {
+    {"may_drain", T_BOOL, offsetof(Socket, may_drain), 0, NULL},
+    {"may_send", T_BOOL, offsetof(Socket, may_send), 0, NULL},
     {NULL, 0, 0, 0, NULL},
 };
-static PyType_Slot drain_slots[] = {
-    {Py_tp_new, drain_new}, {Py_tp_dealloc, drain_dealloc}, {Py_tp_call, drain_call},
-    {Py_tp_traverse, drain_traverse}, {Py_tp_clear, drain_clear}, {Py_tp_members, drain_members},
-    {0, NULL},
+static PyType_Slot socket_slots[] = {
+    {Py_tp_new, socket_new}, {Py_tp_dealloc, socket_dealloc}, {Py_tp_call, socket_call},
+    {Py_tp_traverse, socket_traverse}, {Py_tp_clear, socket_clear},
+    {Py_tp_members, socket_members}, {0, NULL},
 };
-PyType_Spec drain_spec = {
-    "eap._cyclic.Drain", sizeof(Drain), 0,
-    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_IMMUTABLETYPE, drain_slots,
+PyType_Spec socket_spec = {
+    "eap._cyclic.Socket", sizeof(Socket), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_IMMUTABLETYPE, socket_slots,
 };

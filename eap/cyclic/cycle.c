@@ -5,7 +5,7 @@
 #include "cyclic.h"
 
 /* Lists that the station changes between two cycles; then steps, of which the first two may be None. */
-enum { DRAINS, RARELY, SUPERVISORS, CLOSING, PUBLISHERS, GENERATE, RUN_LINKS, REFRESH,
+enum { DRAINS, RARELY, SUPERVISORS, CLOSING, OUTLETS, GENERATE, RUN_LINKS, REFRESH,
        READ_CONTROLS, SAMPLE, WAKE, PARTS };
 
 typedef struct {
@@ -50,7 +50,7 @@ static PyObject *cycle_new(PyTypeObject *type, PyObject *args, PyObject *keyword
     for (int n = 0; fits && n < PARTS; n++) {
         self->parts[n] = PyTuple_GetItem(parts, n);
         Py_INCREF(self->parts[n]);
-        fits = n > PUBLISHERS || PyList_Check(self->parts[n]);
+        fits = n > OUTLETS || PyList_Check(self->parts[n]);
     }
     self->rarely_every = rarely_every;
     self->settled[0] = self->settled[1] = -1;
@@ -77,7 +77,7 @@ static int call_all(PyObject *steps, PyObject *now) {
     for (Py_ssize_t n = 0; !failed && n < PyList_Size(steps); n++) {
         PyObject *step = PyList_GetItem(steps, n);
         Py_INCREF(step);
-        failed = (Py_IS_TYPE(step, drain_type) ? drain(step) : call(step, now)) < 0;
+        failed = (Py_IS_TYPE(step, socket_type) ? drain((Socket *)step) : call(step, now)) < 0;
         Py_DECREF(step);
     }
     return failed ? -1 : 0;
@@ -121,93 +121,95 @@ static int write_own_variables(Cycle *self, int64_t cycle, int is_rare, PyObject
     return changed;
 }
 
-/* Send the frames of one publisher that are due. */
-static int send_frames(PyObject *publisher, PyObject *channel, int64_t cycle, PyObject *now) {
-    PyObject *plan = PyObject_GetAttr(publisher, text_plan), *frames = NULL, *failed = NULL;
-    int result = -1;
-    if (plan != NULL && Py_IS_TYPE(plan, send_plan_type))
-        result = send_due(plan, publisher, channel, now);
-    else if (plan != NULL
-             && (frames = PyObject_CallMethod(publisher, "frames_to_send", "LO", (long long)cycle,
-                                              now)) != NULL
-             && (result = PyObject_IsTrue(frames)) > 0) {
-        failed = PyObject_CallMethodObjArgs(channel, text_send, frames, now, NULL);
-        PyObject *done = failed == NULL ? NULL
-                         : PyObject_CallMethod(publisher, "sent", "OO", failed, now);
-        result = done == NULL ? -1 : 0;
-        Py_XDECREF(done);
+/* Send the frames of one publisher that are due, as Python does. */
+static int send_by_python(const Outlet *outlet, const Moment *moment) {
+    PyObject *failed = NULL, *done = NULL;
+    PyObject *frames = PyObject_CallMethod(outlet->publisher, "frames_to_send", "LO",
+                                           (long long)moment->number, moment->now);
+    int any = frames == NULL ? -1 : PyObject_IsTrue(frames);
+    if (any > 0) {
+        failed = PyObject_CallMethod(outlet->channel, "send", "OO", frames, moment->now);
+        if (failed != NULL)
+            done = PyObject_CallMethod(outlet->publisher, "sent", "OO", failed, moment->now);
+        any = done == NULL ? -1 : 0;
     }
+    Py_XDECREF(done);
     Py_XDECREF(failed);
     Py_XDECREF(frames);
-    Py_XDECREF(plan);
-    return result;
+    return any;
 }
 
-static int send_all(Cycle *self, int64_t cycle, PyObject *now) {
-    PyObject *publishers = self->parts[PUBLISHERS];
+static int send_all(Cycle *self, const Moment *moment) {
+    PyObject *outlets = self->parts[OUTLETS];
     int failed = 0;
-    for (Py_ssize_t n = 0; !failed && n < PyList_Size(publishers); n++) {
-        PyObject *pair = PyList_GetItem(publishers, n);
-        PyObject *publisher = PyTuple_GetItem(pair, 0), *channel = PyTuple_GetItem(pair, 1);
-        if (publisher == NULL || channel == NULL)
-            return -1;
-        Py_INCREF(pair);
-        failed = send_frames(publisher, channel, cycle, now);
-        Py_DECREF(pair);
+    for (Py_ssize_t n = 0; !failed && n < PyList_Size(outlets); n++) {
+        PyObject *each = PyList_GetItem(outlets, n);
+        if (!PyTuple_Check(each) || PyTuple_Size(each) != 4)
+            return refuse("a cycle has outlets of four parts");
+        const Outlet outlet = {PyTuple_GetItem(each, 0), PyTuple_GetItem(each, 1),
+                               PyTuple_GetItem(each, 2), PyTuple_GetItem(each, 3)};
+        Py_INCREF(each);
+        Result result = send_due(&outlet, moment);
+        failed = result == LEFT_TO_PYTHON ? send_by_python(&outlet, moment) : result == FAILED;
+        Py_DECREF(each);
     }
     return failed ? -1 : 0;
 }
 
-static int end_cycle(Cycle *self, int64_t cycle, int64_t late_ns, PyObject *now) {
+static int end_cycle(Cycle *self, const Moment *moment, int64_t late_ns) {
     int64_t *words = self->buffer.buf;
     add(&words[STATION_LATENESS + bin_of(late_ns / 1000)], 1);
     if (late_ns > load(&words[STATION_LATENESS_MAX_NS]))
         store(&words[STATION_LATENESS_MAX_NS], late_ns);
-    if (cycle <= load(&words[STATION_SAMPLED_UNTIL])) {
-        PyObject *done = PyObject_CallFunction(self->parts[SAMPLE], "LO", (long long)cycle, now);
+    if (moment->number <= load(&words[STATION_SAMPLED_UNTIL])) {
+        PyObject *done = PyObject_CallFunction(self->parts[SAMPLE], "LO",
+                                               (long long)moment->number, moment->now);
         Py_XDECREF(done);
         if (done == NULL)
             return -1;
     }
     /* All of the cycle first: snapshots are taken while this word agrees with the counter. */
-    __atomic_store_n(&words[STATION_FUTEX], cycle & 0xFFFFFFFF, __ATOMIC_RELEASE);
-    if (cycle - load(&words[STATION_WAITERS]) <= WAKE_FOR_CYCLES)
+    __atomic_store_n(&words[STATION_FUTEX], moment->number & 0xFFFFFFFF, __ATOMIC_RELEASE);
+    if (moment->number - load(&words[STATION_WAITERS]) <= WAKE_FOR_CYCLES)
         return call(self->parts[WAKE], NULL) < 0 ? -1 : 0;
     return 0;
 }
 
-/* cycle(due_ns, now_ns, behind_ns=0) */
-static PyObject *cycle_call(Cycle *self, PyObject *args, PyObject *keywords) {
-    long long due_ns, behind_ns = 0;
-    PyObject *now;
-    (void)keywords;
-    if (!PyArg_ParseTuple(args, "LO|L", &due_ns, &now, &behind_ns))
+/* run(due_ns, now_ns, behind_ns=0) */
+static PyObject *cycle_run(Cycle *self, PyObject *const *args, Py_ssize_t count) {
+    if (count < 2 || count > 3)
+        return PyErr_Format(PyExc_TypeError, "a cycle takes two or three times");
+    int64_t *words = self->buffer.buf, due_ns = PyLong_AsLongLong(args[0]);
+    const Moment moment = {load(&words[STATION_CYCLE]) + 1, PyLong_AsLongLong(args[1]), args[1]};
+    int64_t behind_ns = count == 3 ? PyLong_AsLongLong(args[2]) : 0;
+    if (PyErr_Occurred())
         return NULL;
-    int64_t *words = self->buffer.buf, now_ns = PyLong_AsLongLong(now);
-    if (now_ns == -1 && PyErr_Occurred())
-        return NULL;
-    const int64_t cycle = load(&words[STATION_CYCLE]) + 1;
-    store(&words[STATION_CYCLE], cycle);
+    store(&words[STATION_CYCLE], moment.number);
     store(&words[STATION_CYCLE_AT_NS], due_ns);
     __atomic_thread_fence(__ATOMIC_RELEASE);
-    int is_rare = !(cycle % self->rarely_every);
+    int is_rare = !(moment.number % self->rarely_every);
     int has_own = self->parts[GENERATE] != Py_None || PyList_Size(self->parts[DRAINS]) > 0;
-    int changed = has_own || is_rare ? write_own_variables(self, cycle, is_rare, now)
-                                     : refresh(self);
+    int changed = has_own || is_rare
+                      ? write_own_variables(self, moment.number, is_rare, moment.now)
+                      : refresh(self);
     if (changed < 0 || (changed && call(self->parts[READ_CONTROLS], NULL) < 0)
-        || (self->sends && send_all(self, cycle, now)) || call_all(self->parts[CLOSING], now)
-        || end_cycle(self, cycle, now_ns - due_ns - behind_ns, now))
+        || (self->sends && send_all(self, &moment)) || call_all(self->parts[CLOSING], moment.now)
+        || end_cycle(self, &moment, moment.now_ns - due_ns - behind_ns))
         return NULL;
     Py_RETURN_NONE;
 }
 
+static PyMethodDef cycle_methods[] = {
+    {"run", (PyCFunction)(void (*)(void))cycle_run, METH_FASTCALL, NULL},
+    {NULL, NULL, 0, NULL},
+};
 static PyMemberDef cycle_members[] = {
     {"sends", T_BOOL, offsetof(Cycle, sends), 0, NULL},
     {NULL, 0, 0, 0, NULL},
 };
 static PyType_Slot cycle_slots[] = {
-    {Py_tp_new, cycle_new}, {Py_tp_dealloc, cycle_dealloc}, {Py_tp_call, cycle_call},
-    {Py_tp_traverse, cycle_traverse}, {Py_tp_clear, cycle_clear}, {Py_tp_members, cycle_members},
+    {Py_tp_new, cycle_new}, {Py_tp_dealloc, cycle_dealloc}, {Py_tp_traverse, cycle_traverse},
+    {Py_tp_clear, cycle_clear}, {Py_tp_methods, cycle_methods}, {Py_tp_members, cycle_members},
     {0, NULL},
 };
 PyType_Spec cycle_spec = {

@@ -94,21 +94,38 @@ Result take(PortHandler *self, const uint8_t *data, Py_ssize_t size, int64_t at_
 
 /* ---- batch.c ---- */
 
-/* Hand over what waits at the socket of a Drain; return how many frames had a handler, or -1. */
-Py_ssize_t drain(PyObject *self);
+typedef struct {
+    PyObject_HEAD
+    PyObject *receiver, *handlers, *origin, *sender;
+    int fd;
+    char may_drain, may_send;
+} Socket;
+
+/* Hand over what waits at a socket; return how many frames had a handler, or -1. */
+Py_ssize_t drain(Socket *self);
 
 /* ---- send.c ---- */
 
-/* Send the frames of a SendPlan that are due through *channel*, and count them; -1 for an error. */
-int send_due(PyObject *plan, PyObject *publisher, PyObject *channel, PyObject *now);
+/* A publisher of a station, its channel, its SendPlan, and the Socket of the channel. */
+typedef struct {
+    PyObject *publisher, *channel, *plan, *socket;
+} Outlet;
+
+/* A cycle and its time, which is there twice. */
+typedef struct {
+    int64_t number, now_ns;
+    PyObject *now;
+} Moment;
+
+/* Send the frames that are due, and count them, if all are in the plan. */
+Result send_due(const Outlet *outlet, const Moment *moment);
 
 /* ---- Types, made by module.c, and interned texts ---- */
 
-extern PyTypeObject *plan_type, *handler_type, *receiver_type, *drain_type, *patch_type,
+extern PyTypeObject *plan_type, *handler_type, *receiver_type, *socket_type, *patch_type,
     *send_plan_type;
-extern PyType_Spec plan_spec, handler_spec, receiver_spec, drain_spec, patch_spec, send_plan_spec,
+extern PyType_Spec plan_spec, handler_spec, receiver_spec, socket_spec, patch_spec, send_plan_spec,
     cycle_spec, waiter_spec, cycle_frame_spec;
-extern PyObject *text_fast, *text_source, *text_source_of, *text_wanted, *text_direct, *text_send,
-    *text_address_of, *text_plan;
+extern PyObject *text_fast, *text_source, *text_source_of, *text_wanted;
 
 #endif

@@ -7,17 +7,16 @@
 /* Parameters, plans and offsets as eap/compiled.py gives them; raised when either side changes. */
 #define API 7
 
-PyTypeObject *plan_type, *handler_type, *receiver_type, *drain_type, *patch_type, *send_plan_type;
+PyTypeObject *plan_type, *handler_type, *receiver_type, *socket_type, *patch_type, *send_plan_type;
 static PyTypeObject *cycle_type, *waiter_type, *cycle_frame_type;
-PyObject *text_fast, *text_source, *text_source_of, *text_wanted, *text_direct, *text_send,
-    *text_address_of, *text_plan;
+PyObject *text_fast, *text_source, *text_source_of, *text_wanted;
 
 static const struct {
     PyType_Spec *spec;
     PyTypeObject **type;
 } types[] = {
     {&plan_spec, &plan_type},         {&handler_spec, &handler_type},
-    {&receiver_spec, &receiver_type}, {&drain_spec, &drain_type},
+    {&receiver_spec, &receiver_type}, {&socket_spec, &socket_type},
     {&patch_spec, &patch_type},       {&send_plan_spec, &send_plan_type},
     {&cycle_spec, &cycle_type},       {&waiter_spec, &waiter_type},
     {&cycle_frame_spec, &cycle_frame_type},
@@ -27,9 +26,10 @@ static const struct {
     PyObject **text;
     const char *value;
 } texts[] = {
-    {&text_fast, "fast"},     {&text_source, "source"}, {&text_source_of, "source_of"},
-    {&text_wanted, "wanted"}, {&text_direct, "direct"}, {&text_send, "send"},
-    {&text_plan, "plan"},     {&text_address_of, "address_of"},
+    {&text_fast, "fast"},
+    {&text_source, "source"},
+    {&text_source_of, "source_of"},
+    {&text_wanted, "wanted"},
 };
 
 /* In the order of eap/pd/compiledplan.py. */

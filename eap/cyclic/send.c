@@ -190,43 +190,63 @@ typedef struct {
 
 typedef struct {
     PyObject_HEAD
-    PyObject *frames, *patches;
-    PyObject *direct, *addresses;  /* sender that the headers were made for */
     Py_buffer words;
+    Py_ssize_t count;  /* -1: Python has to select frames */
+    PyObject *frames, *patches;
     Row *rows;
     struct mmsghdr *headers, *due;
     struct iovec *vectors;
-    Py_ssize_t count, row_size;
-    int fd;
+    PyObject *addresses, *socket;  /* that the headers were completed for */
 } SendPlan;
 
-static void plan_dealloc(SendPlan *self) {
-    Py_XDECREF(self->frames);
-    Py_XDECREF(self->patches);
-    Py_XDECREF(self->direct);
-    Py_XDECREF(self->addresses);
-    release_buffer(&self->words);
+static void plan_free(SendPlan *self) {
+    self->count = -1;
+    Py_CLEAR(self->frames);
+    Py_CLEAR(self->patches);
+    Py_CLEAR(self->addresses);
+    Py_CLEAR(self->socket);
     PyMem_Free(self->rows);
     PyMem_Free(self->headers);
     PyMem_Free(self->due);
     PyMem_Free(self->vectors);
+    self->rows = NULL;
+    self->headers = self->due = NULL;
+    self->vectors = NULL;
+}
+
+static void plan_dealloc(SendPlan *self) {
+    plan_free(self);
+    release_buffer(&self->words);
     free_object((PyObject *)self);
 }
 
-static int plan_check(SendPlan *self) {
-    size_t count = (size_t)self->count;
-    if (PyList_Size(self->patches) != self->count || (uintptr_t)self->words.buf % WORD
-        || self->row_size != self->count * (Py_ssize_t)sizeof(Row)
-        || self->words.len < STATION_WORDS * WORD)
+/* SendPlan(words): of the image. */
+static PyObject *plan_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
+    PyObject *words;
+    if (!PyArg_ParseTuple(args, "O", &words))
+        return NULL;
+    SendPlan *self = (SendPlan *)make_object(type, keywords);
+    if (self == NULL)
+        return NULL;
+    self->count = -1;
+    if (PyObject_GetBuffer(words, &self->words, PyBUF_CONTIG))
+        Py_CLEAR(self);
+    return (PyObject *)self;
+}
+
+static int plan_check(SendPlan *self, Py_ssize_t row_size) {
+    const Py_ssize_t count = PyList_Size(self->frames);
+    if (PyList_Size(self->patches) != count || (uintptr_t)self->words.buf % WORD
+        || row_size != count * (Py_ssize_t)sizeof(Row))
         return refuse("a plan has a patch and a row for each frame");
-    self->headers = PyMem_Calloc(count + 1, sizeof *self->headers);
-    self->due = PyMem_Calloc(count + 1, sizeof *self->due);
-    self->vectors = PyMem_Calloc(count + 1, sizeof *self->vectors);
+    self->headers = PyMem_Calloc((size_t)count + 1, sizeof *self->headers);
+    self->due = PyMem_Calloc((size_t)count + 1, sizeof *self->due);
+    self->vectors = PyMem_Calloc((size_t)count + 1, sizeof *self->vectors);
     if (self->headers == NULL || self->due == NULL || self->vectors == NULL) {
         PyErr_NoMemory();
         return -1;
     }
-    for (Py_ssize_t n = 0; n < self->count; n++) {
+    for (Py_ssize_t n = 0; n < count; n++) {
         const Row *row = &self->rows[n];
         const Patch *patch = (Patch *)PyList_GetItem(self->patches, n);
         if (!Py_IS_TYPE((PyObject *)patch, patch_type) || row->step < 1
@@ -238,75 +258,81 @@ static int plan_check(SendPlan *self) {
         self->headers[n].msg_hdr.msg_iov = &self->vectors[n];
         self->headers[n].msg_hdr.msg_iovlen = 1;
     }
+    self->count = count;
     return 0;
 }
 
-/* SendPlan(frames, patches, rows, words) */
-static PyObject *plan_new(PyTypeObject *type, PyObject *args, PyObject *keywords) {
-    PyObject *frames, *patches, *words;
+/* fill(frames, patches, rows): of all frames of the port. */
+static PyObject *plan_fill(SendPlan *self, PyObject *args) {
+    PyObject *frames, *patches;
     const char *rows;
-    SendPlan *self = (SendPlan *)make_object(type, keywords);
-    if (self == NULL)
+    Py_ssize_t row_size;
+    if (!PyArg_ParseTuple(args, "OOy#", &frames, &patches, &rows, &row_size))
         return NULL;
-    if (PyArg_ParseTuple(args, "O!O!y#O", &PyTuple_Type, &frames, &PyTuple_Type, &patches, &rows,
-                         &self->row_size, &words)) {
-        self->count = PyTuple_Size(frames);
-        self->frames = PySequence_List(frames);
-        self->patches = PySequence_List(patches);
-        if (self->frames != NULL && self->patches != NULL
-            && (self->rows = copy_of(rows, self->row_size)) != NULL
-            && !PyObject_GetBuffer(words, &self->words, PyBUF_CONTIG) && !plan_check(self))
-            return (PyObject *)self;
-    }
-    Py_DECREF(self);
+    plan_free(self);
+    if ((self->frames = PySequence_List(frames)) != NULL
+        && (self->patches = PySequence_List(patches)) != NULL
+        && (self->rows = copy_of(rows, row_size)) != NULL && !plan_check(self, row_size))
+        Py_RETURN_NONE;
+    plan_free(self);
     return NULL;
 }
 
-/* Describe all frames to the kernel for *direct*, a SendBatch. */
-static int direct_to(SendPlan *self, PyObject *direct) {
+/* clear(): leave all frames to Python. */
+static PyObject *plan_clear(SendPlan *self, PyObject *nothing) {
+    (void)nothing;
+    plan_free(self);
+    Py_RETURN_NONE;
+}
+
+/* Complete the headers with the addresses of all frames. */
+static int address(SendPlan *self, Socket *socket) {
     PyObject *addresses = PyList_New(self->count);
-    int fd = PyObject_AsFileDescriptor(direct);
-    if (addresses == NULL || fd < 0)
-        goto failed;
+    if (addresses == NULL)
+        return -1;
+    Py_CLEAR(self->socket);
     for (Py_ssize_t n = 0; n < self->count; n++) {
-        PyObject *frame = PyList_GetItem(self->frames, n);
-        PyObject *address = PyObject_CallMethodObjArgs(direct, text_address_of, frame, NULL);
-        if (address == NULL || PyList_SetItem(addresses, n, address))
+        PyObject *found = PyObject_CallMethod(socket->sender, "address_of", "O",
+                                              PyList_GetItem(self->frames, n));
+        if (found == NULL || PyList_SetItem(addresses, n, found))
             goto failed;
-        if (!PyBytes_Check(address)) {
+        if (!PyBytes_Check(found)) {
             refuse("an address is packed into bytes");
             goto failed;
         }
-        Py_ssize_t size = PyBytes_Size(address);
-        self->headers[n].msg_hdr.msg_name = size ? PyBytes_AsString(address) : NULL;
+        Py_ssize_t size = PyBytes_Size(found);
+        self->headers[n].msg_hdr.msg_name = size ? PyBytes_AsString(found) : NULL;
         self->headers[n].msg_hdr.msg_namelen = (socklen_t)size;
     }
     Py_XDECREF(self->addresses);
     self->addresses = addresses;
-    Py_INCREF(direct);
-    Py_XDECREF(self->direct);
-    self->direct = direct;
-    self->fd = fd;
+    Py_INCREF((PyObject *)socket);
+    self->socket = (PyObject *)socket;
     return 0;
 failed:
-    Py_XDECREF(addresses);
-    Py_CLEAR(self->direct);  /* the headers may have lost their addresses */
+    Py_DECREF(addresses);
     return -1;
-}
-
-/* Send the first *count* of the due frames in one call; return how many the kernel took, or -1. */
-static int transmit(SendPlan *self, Py_ssize_t count) {
-    struct mmsghdr *headers = count == self->count ? self->headers : self->due;
-    if (count > 1)
-        return sendmmsg(self->fd, headers, (unsigned)count, MSG_DONTWAIT);
-    const struct msghdr *only = &headers->msg_hdr;
-    return sendto(self->fd, only->msg_iov->iov_base, only->msg_iov->iov_len, MSG_DONTWAIT,
-                  only->msg_name, only->msg_namelen) < 0 ? -1 : 1;
 }
 
 static int is_due(const Row *row, int64_t cycle) { return cycle % row->step == row->phase; }
 
-/* Return the frames that are due as a list. */
+/* Hand the *count* due frames to the kernel; return how many it took, or -1. */
+static int transmit(SendPlan *self, int fd, Py_ssize_t count, int64_t cycle) {
+    struct mmsghdr *headers = self->headers;
+    if (count < self->count) {
+        headers = self->due;
+        for (Py_ssize_t n = 0, to = 0; n < self->count; n++)
+            if (is_due(&self->rows[n], cycle))
+                headers[to++] = self->headers[n];
+    }
+    if (count > 1)
+        return sendmmsg(fd, headers, (unsigned)count, MSG_DONTWAIT);
+    const struct msghdr *only = &headers->msg_hdr;
+    return sendto(fd, only->msg_iov->iov_base, only->msg_iov->iov_len, MSG_DONTWAIT,
+                  only->msg_name, only->msg_namelen) < 0 ? -1 : 1;
+}
+
+/* Return the due frames as a list. */
 static PyObject *due_frames(const SendPlan *self, int64_t cycle) {
     PyObject *frames = PyList_New(0);
     for (Py_ssize_t n = 0; frames != NULL && n < self->count; n++)
@@ -316,68 +342,70 @@ static PyObject *due_frames(const SendPlan *self, int64_t cycle) {
     return frames;
 }
 
-/* Send the due frames through *channel*; return those that were not sent, NULL for an error. */
-static PyObject *send_frames(SendPlan *self, PyObject *channel, Py_ssize_t count, int64_t cycle,
-                             PyObject *now) {
-    PyObject *failed = NULL, *frames = NULL, *direct = PyObject_GetAttr(channel, text_direct);
-    if (direct == NULL)
-        return NULL;
-    if (direct != Py_None) {
-        if (direct != self->direct && direct_to(self, direct))
-            goto done;
-        if (count < self->count) {
-            struct mmsghdr *to = self->due;
-            for (Py_ssize_t n = 0; n < self->count; n++)
-                if (is_due(&self->rows[n], cycle))
-                    *to++ = self->headers[n];
-        }
-        int sent = transmit(self, count), number = errno;
+/* Send the due frames, which are patched; return those that were not sent, NULL for an error. */
+static PyObject *send_frames(SendPlan *self, const Outlet *outlet, Py_ssize_t count,
+                             const Moment *moment) {
+    Socket *socket = (Socket *)outlet->socket;
+    PyObject *frames, *failed;
+    int sent = 0, number = 0;
+    const int is_direct = Py_IS_TYPE(outlet->socket, socket_type) && socket->may_send;
+    if (is_direct) {
+        if (self->socket != outlet->socket && address(self, socket))
+            return NULL;
+        sent = transmit(self, socket->fd, count, moment->number);
+        number = errno;
         if (sent == count) {
             Py_INCREF(Py_None);
-            failed = Py_None;
-        } else if ((frames = due_frames(self, cycle)) != NULL)
-            failed = PyObject_CallMethod(direct, "go_on", "Oii", frames, sent, number);
-    } else if ((frames = due_frames(self, cycle)) != NULL)
-        failed = PyObject_CallMethodObjArgs(channel, text_send, frames, now, NULL);
-done:
-    Py_XDECREF(frames);
-    Py_DECREF(direct);
+            return Py_None;
+        }
+    }
+    if ((frames = due_frames(self, moment->number)) == NULL)
+        return NULL;
+    if (is_direct)
+        failed = PyObject_CallMethod(socket->sender, "go_on", "Oii", frames, sent, number);
+    else
+        failed = PyObject_CallMethod(outlet->channel, "send", "OO", frames, moment->now);
+    Py_DECREF(frames);
     return failed;
 }
 
-int send_due(PyObject *plan, PyObject *publisher, PyObject *channel, PyObject *now) {
-    SendPlan *self = (SendPlan *)plan;
-    int64_t *words = self->words.buf, now_ns = PyLong_AsLongLong(now);
-    if (now_ns == -1 && PyErr_Occurred())
-        return -1;
-    const int64_t cycle = load(&words[STATION_CYCLE]);
+Result send_due(const Outlet *outlet, const Moment *moment) {
+    SendPlan *self = (SendPlan *)outlet->plan;
+    if (!Py_IS_TYPE(outlet->plan, send_plan_type) || self->count < 0)
+        return LEFT_TO_PYTHON;
     Py_ssize_t count = 0;
     for (Py_ssize_t n = 0; n < self->count; n++)
-        if (is_due(&self->rows[n], cycle)) {
-            patch_run((Patch *)PyList_GetItem(self->patches, n), cycle);
+        if (is_due(&self->rows[n], moment->number)) {
+            patch_run((Patch *)PyList_GetItem(self->patches, n), moment->number);
             count++;
         }
     if (!count)
-        return 0;
-    PyObject *failed = send_frames(self, channel, count, cycle, now);
-    int any = failed == NULL ? -1 : PyObject_IsTrue(failed);
+        return TAKEN;
+    PyObject *failed = send_frames(self, outlet, count, moment);
+    int any = failed == NULL ? -1 : failed == Py_None ? 0 : PyObject_IsTrue(failed);
     if (any > 0) {
-        PyObject *done = PyObject_CallMethod(publisher, "sent_partly", "LOO", (long long)cycle,
-                                             failed, now);
+        PyObject *done = PyObject_CallMethod(outlet->publisher, "sent_partly", "LOO",
+                                             (long long)moment->number, failed, moment->now);
         any = done == NULL ? -1 : 1;
         Py_XDECREF(done);
     }
-    for (Py_ssize_t n = 0; !any && n < self->count; n++)
-        if (is_due(&self->rows[n], cycle)) {
-            add(&words[self->rows[n].whole], 1);
-            store(&words[self->rows[n].sent_at], now_ns);
-        }
     Py_XDECREF(failed);
-    return any < 0 ? -1 : 0;
+    int64_t *words = self->words.buf;
+    for (Py_ssize_t n = 0; !any && n < self->count; n++)
+        if (is_due(&self->rows[n], moment->number)) {
+            add(&words[self->rows[n].whole], 1);
+            store(&words[self->rows[n].sent_at], moment->now_ns);
+        }
+    return any < 0 ? FAILED : TAKEN;
 }
 
+static PyMethodDef plan_methods[] = {
+    {"fill", (PyCFunction)plan_fill, METH_VARARGS, NULL},
+    {"clear", (PyCFunction)plan_clear, METH_NOARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
 static PyType_Slot plan_slots[] = {
-    {Py_tp_new, plan_new}, {Py_tp_dealloc, plan_dealloc}, {0, NULL},
+    {Py_tp_new, plan_new}, {Py_tp_dealloc, plan_dealloc}, {Py_tp_methods, plan_methods}, {0, NULL},
 };
 PyType_Spec send_plan_spec = {
     "eap._cyclic.SendPlan", sizeof(SendPlan), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_IMMUTABLETYPE,

@@ -302,7 +302,7 @@ class PortChannels:
 def _drain_of(channel: UdpChannel | EthernetInterface) -> Callable[[int], object]:
     if isinstance(channel, UdpChannel):
         return channel.drain
-    drain: Callable[[int], object] = channel.compiled_drain or (lambda now_ns: channel.drain())
+    drain: Callable[[int], object] = channel.compiled or (lambda now_ns: channel.drain())
     return drain
 
 

@@ -79,8 +79,8 @@ class EthernetInterface:
         self._ports: list[EthernetPort] = []
         self.has_neighbours = False
         self._local: deque[tuple[FrameHandler, memoryview, int]] = deque()
-        self.compiled_drain = batch.compiled_drain(sock.fileno(), self._routes, self)
-        self._pause_compiled()
+        self.compiled = batch.compiled_socket(sock.fileno(), self._routes, self, self.sender)
+        self.allow_compiled()
 
     def port(
         self,
@@ -119,7 +119,9 @@ class EthernetInterface:
         for address in (self.address, BROADCAST_MAC, *port.groups):
             by_address.setdefault(_key(address), []).append(port.handler)
         self._ports.append(port)
-        self._count_ports()
+        # Copies for other ports cost time in each cycle, so a single port makes none.
+        self.has_neighbours = len(self._ports) > 1
+        self.allow_compiled()
         if port.own_address != self.address:
             port.readdress()
 
@@ -128,7 +130,8 @@ class EthernetInterface:
         # The socket stays a member of the port's groups: to leave one waits for a lock of the
         # kernel, and this is called between two cycles.
         self._ports.remove(port)
-        self._count_ports()
+        self.has_neighbours = len(self._ports) > 1
+        self.allow_compiled()
         by_address = self._routes[port.vlan_id]
         for address in (self.address, BROADCAST_MAC, *port.groups):
             by_address[_key(address)].remove(port.handler)
@@ -138,16 +141,12 @@ class EthernetInterface:
             del self._routes[port.vlan_id]
         self._local = deque(each for each in self._local if each[0] != port.handler)
 
-    def _count_ports(self) -> None:
-        # Copies for other ports cost time in each cycle, so a single port makes none.
-        self.has_neighbours = len(self._ports) > 1
-        for port in self._ports:
-            port.find_direct()
-
-    def _pause_compiled(self) -> None:
-        """Leave to Python what the compiled part does not know of."""
-        if self.compiled_drain is not None:
-            self.compiled_drain.is_paused = bool(self._local) or self._binding.is_lost
+    def allow_compiled(self) -> None:
+        """Have Python do what the compiled part knows nothing of."""
+        if self.compiled is not None:
+            self.compiled.may_drain = not (self._local or self._binding.is_lost)
+            is_readdressed = any(port.is_readdressed for port in self._ports)
+            self.compiled.may_send = not (self.has_neighbours or is_readdressed)
 
     def drain(self) -> int:
         """Hand every waiting frame to the ports it is for; return how many were handed over."""
@@ -168,7 +167,7 @@ class EthernetInterface:
     def find(self) -> None:
         """Look for an interface that was deleted: has it been made again?"""
         is_found = self._binding.find()
-        self._pause_compiled()
+        self.allow_compiled()
         if not is_found:
             return
         before, self.address = self.address, self._binding.address
@@ -199,7 +198,7 @@ class EthernetInterface:
                     self.discarded["local_overflow"] += 1
                 else:
                     self._local.append((handler, data, now_ns))
-        self._pause_compiled()
+        self.allow_compiled()
 
     def exchange_handler(self, old: FrameHandler, new: FrameHandler) -> None:
         """Hand to *new* the frames that were handed to *old*, if it is a handler here."""
@@ -241,7 +240,7 @@ class EthernetInterface:
         if number == ENETDOWN:
             # Once, for switched off as for deleted.
             self._binding.is_lost = True
-            self._pause_compiled()
+            self.allow_compiled()
         note_receive_error(self.errors, number)
         self.find()
         return False
@@ -295,7 +294,7 @@ class EthernetInterface:
         for _ in range(count):
             handle, data, at_ns = self._local.popleft()
             handle(data, len(data), at_ns, self)
-        self._pause_compiled()
+        self.allow_compiled()
         return count
 
 
@@ -318,9 +317,9 @@ class EthernetPort:
         self.groups = groups
         self.own_address = interface.address
         self._send = interface.sender.send
-        self._is_readdressed = False
-        self.direct: SendBatch | None = None
-        override(self, "drain", interface.compiled_drain)
+        self.is_readdressed = False
+        self.direct = interface.compiled
+        override(self, "drain", interface.compiled)
         # VID 0 with a priority is a priority tag (802.1Q); without both the frame is untagged.
         tag = priority << 13 | vlan_id
         self._tag = struct.pack("!HH", _TPID, tag) if tag else b""
@@ -346,13 +345,8 @@ class EthernetPort:
         """Write the interface's present address into each frame that is sent from now on."""
         # Frames are prebuilt, by publishers and repliers; only sending sees all of them.
         self._send = self._send_readdressed
-        self._is_readdressed = True
-        self.find_direct()
-
-    def find_direct(self) -> None:
-        """Note whether :meth:`send` does more than to hand frames to the socket."""
-        plain = not (self.interface.has_neighbours or self._is_readdressed)
-        self.direct = self.interface.sender if plain else None
+        self.is_readdressed = True
+        self.interface.allow_compiled()
 
     def link_header(self, destination: str) -> bytes:
         """Return destination, own address, the port's VLAN tag if it has one, and EtherType."""

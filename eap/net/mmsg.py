@@ -136,18 +136,22 @@ class ReceiveBatch:
         headers = ctypes.c_void_p(_address(self._headers))
         return partial(_recvmmsg, fd, headers, BATCH, socket.MSG_DONTWAIT, None)
 
-    def compiled_drain(self, fd: int, handlers: object, origin: object) -> Any:
+    def compiled_socket(
+        self, fd: int, handlers: object, origin: object, sender: SendBatch | None
+    ) -> Any:
         """Return what drains a socket into this memory; None without compiled part.
 
         It does what the channels of this package do by :meth:`reader`, and calls compiled handlers
-        without a detour.
+        without a detour.  The cycle of a station sends through it.
 
         Args:
             fd: Of the socket.
             handlers: A list, or those of an Ethernet interface by VLAN and address.
             origin: Its ``note_error`` is called for errors, its ``count_unrouted`` for frames
-                without handlers, and its ``drain`` in place of all that as long as ``is_paused``
-                of the result is true.
+                without handlers, and its ``drain`` in place of all that unless ``may_drain`` of
+                the result is true.
+            sender: What goes on where the kernel did not take a frame.  It is not used unless
+                ``may_send`` of the result is true.
         """
         if cyclic is None:
             return None
@@ -160,7 +164,7 @@ class ReceiveBatch:
                 self._headroom,
                 self.views,
             )
-        return cyclic.Drain(self._compiled, fd, handlers, origin)
+        return cyclic.Socket(self._compiled, fd, handlers, origin, sender)
 
     def arrival(self) -> tuple[memoryview, int, int]:
         """Return view, whole size and monotonic arrival time of the only message of a batch."""
@@ -316,10 +320,6 @@ class SendBatch:
                 return failed
             sent = self._call(headers, done)()
             number = ctypes.get_errno()
-
-    def fileno(self) -> int:
-        """Return the descriptor of the socket."""
-        return self._fd
 
     def address_of(self, frame: OutFrame) -> bytes:
         """Return the packed socket address of *frame*; nothing if the socket knows it."""

@@ -43,10 +43,11 @@ class UdpChannel:
         self._sock = sock
         self._batch = batch
         self._receive = batch.reader(sock.fileno())
-        self.direct = SendBatch(sock, _socket_address)
+        self._sender = SendBatch(sock, _socket_address)
         self.source_of = batch.source_reader()
-        self.errors = self.direct.errors
-        override(self, "drain", batch.compiled_drain(sock.fileno(), self.handlers, self))
+        self.errors = self._sender.errors
+        self.direct = batch.compiled_socket(sock.fileno(), self.handlers, self, self._sender)
+        override(self, "drain", self.direct)
 
     def drain(self, now_ns: int) -> int:
         """Hand every waiting frame to the handlers, at most 256 in one call."""
@@ -88,7 +89,7 @@ class UdpChannel:
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         """Send *frames* to their destinations; return those that the kernel rejected."""
         del now_ns
-        return self.direct.send(frames)
+        return self._sender.send(frames)
 
     def link_header(self, destination: str) -> bytes:
         """Return nothing: the kernel writes the headers of a datagram to *destination*."""

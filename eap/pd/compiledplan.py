@@ -136,20 +136,20 @@ def compile_patch(
     return patch
 
 
-def compile_groups(groups: Sequence[FrameGroup], words: memoryview) -> object:
-    """Return what the compiled part sends of the frames of one port; None without it."""
-    if _cyclic is None:
-        return None
+def make_send_plan(words: memoryview) -> Any:
+    """Return a plan of the frames of one port that the compiled part sends; None without it."""
+    return None if _cyclic is None else _cyclic.SendPlan(words)
+
+
+def fill_send_plan(plan: Any, groups: Sequence[FrameGroup]) -> None:
+    """Have *plan* send the frames of *groups*, which are all of the port."""
     frames = [frame for group in groups for frame in group.frames]
     rows = bytearray()
     for group in groups:
         for counters in group.counters:
             rows += _row(group.schedule.step, group.schedule.phase, *counters)
-    return _cyclic.SendPlan(
-        tuple(frame.whole.out for frame in frames),
-        tuple(frame.whole.patch for frame in frames),
-        bytes(rows),
-        words,
+    plan.fill(
+        [frame.whole.out for frame in frames], [frame.whole.patch for frame in frames], bytes(rows)
     )
 
 
@@ -160,8 +160,7 @@ def compile_cycle(words: memoryview, rarely_every: int, *parts: object) -> Any:
         words: Of its image.
         rarely_every: Cycles between two drains of the ports that are drained rarely.
         parts: Lists of drains, of such that are rare, of supervisors, of closing steps and of
-            publishers with their channels.  Then the steps that compute variables, run links, copy
-            inputs, read controls, take a sample and wake waiting programs; the first two may be
-            None.
+            outlets.  Then the steps that compute variables, run links, copy inputs, read controls,
+            take a sample and wake waiting programs; the first two may be None.
     """
     return None if _cyclic is None else _cyclic.Cycle(words, rarely_every, parts)

@@ -59,22 +59,6 @@ class OutFrame:
         self.oversized = False
 
 
-class DirectSender(Protocol):
-    """The socket of a channel whose frames go as they are, for the compiled part."""
-
-    def fileno(self) -> int:
-        """Return its descriptor."""
-
-    def address_of(self, frame: OutFrame) -> bytes:
-        """Return the packed socket address of *frame*; nothing if the socket knows it."""
-
-    def go_on(self, frames: Sequence[OutFrame], sent: int, number: int) -> Sequence[OutFrame]:
-        """Continue a call that sent the first *sent* of *frames*, or failed with errno *number*.
-
-        *sent* is -1 then.  Return those that could not be sent, as ``FrameChannel.send`` does.
-        """
-
-
 def exchange(handlers: list[FrameHandler], old: FrameHandler, new: FrameHandler) -> None:
     """Put *new* in the place of *old* in a list of handlers."""
     # By identity: frames may be read by an object and its successor, which may be equal.
@@ -85,8 +69,8 @@ class FrameChannel(Protocol):
     """Transport of frames: a UDP socket, an Ethernet interface, a TCP connection, a loopback."""
 
     @property
-    def direct(self) -> DirectSender | None:
-        """Socket to which frames go as they are; None if :meth:`send` does more."""
+    def direct(self) -> object:
+        """Socket of the compiled part to which frames go as they are; None if there is none."""
 
     def drain(self, now_ns: int) -> int:
         """Hand every waiting frame to its handlers, at most a bounded number; return how many."""

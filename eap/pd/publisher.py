@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 from eap.ids import NetId
 from eap.pd.address import from_word, net_id_of, to_word
-from eap.pd.compiledplan import compile_groups
+from eap.pd.compiledplan import fill_send_plan, make_send_plan
 from eap.pd.image import Image, Inputs
 from eap.pd.layout import FRAME_CTRL, VAR_CTRL, FrameSlot, TxSlot
 from eap.pd.link import FrameChannel, OutFrame
@@ -129,8 +129,8 @@ class Publisher:
             self.frames.append(frame)
             self._note_target(frame, net_id)
         self._controls: dict[str, int] = {}
-        self.plan: object = None
-        """The groups for the compiled part; None if Python has to select frames."""
+        self.plan = make_send_plan(image.words)
+        """Frames that the compiled part sends: all or none; None without it."""
         self._groups: list[FrameGroup] = []
         self._due: list[FrameGroup] = []
         self._others: list[TxFrame] = []
@@ -178,7 +178,10 @@ class Publisher:
                 plain.setdefault(frame.schedule, []).append(frame)
         self._groups = [FrameGroup(schedule, frames) for schedule, frames in plain.items()]
         self._others = [frame for frame in self.frames if not frame.is_plain]
-        self.plan = None if self._others else compile_groups(self._groups, self._words)
+        if self.plan is not None:
+            self.plan.clear()
+            if not self._others:
+                fill_send_plan(self.plan, self._groups)
 
     def forget(self) -> None:
         """Reset the triggers: on-change PDs are due at once, and no event is pending.
@@ -219,7 +222,8 @@ class Publisher:
 
     def release(self) -> None:
         """Free all frames one by one: freeing many at once would delay the cycles."""
-        self.plan = None
+        if self.plan is not None:
+            self.plan.clear()
         for container in (self._groups, self._due, self._others, self._sending):
             container.clear()
         while self.frames:

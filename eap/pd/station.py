@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import msgspec
 
@@ -55,6 +55,10 @@ class _ConnectedPort(NamedTuple):
     groups: tuple[FrameChannel, ...]
 
 
+_Outlet: TypeAlias = tuple[Publisher | PollResponder, FrameChannel, object, object]
+"""A publisher and its channel; what the compiled part has of both, None without it."""
+
+
 class Station:
     """Runs the cycle of one station.
 
@@ -93,7 +97,7 @@ class Station:
         """True if variables are computed in the cycle."""
         self._origins = find_origins(image.layout, spec.links)
         self.buses: list[CyclicBus] = []
-        self._publishers: list[tuple[Publisher | PollResponder, FrameChannel]] = []
+        self._outlets: list[_Outlet] = []
         self._sends = False
         self._senders: list[tuple[str, Publisher | PollResponder, FrameChannel]] = []
         """The publishers with their ports, and the channels without taps."""
@@ -136,15 +140,16 @@ class Station:
             self._rarely,
             self._supervisors,
             self._closing,
-            self._publishers,
+            self._outlets,
             self._generate if self._computes else None,
             self._run_links,
             self._inputs.refresh,
-            partial(_read_controls, self._publishers),
+            partial(_read_controls, self._outlets),
             self._samples.end_cycle,
             wake,
         )
-        override(self, "cycle", self._compiled)
+        if self._compiled is not None:
+            override(self, "cycle", self._compiled.run)
 
     def _subscriber(self, port: str) -> Subscriber:
         rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
@@ -211,10 +216,10 @@ class Station:
     def _connect_senders(self) -> None:
         """Have the publishers send through their channels, or through the taps of their ports."""
         # In place, as all lists of steps: the compiled cycle goes through the same ones.
-        self._publishers[:] = [
-            (publisher, self._taps[port][0].sending(channel) if port in self._taps else channel)
-            for port, publisher, channel in self._senders
-        ]
+        self._outlets.clear()
+        for port, publisher, channel in self._senders:
+            out = self._taps[port][0].sending(channel) if port in self._taps else channel
+            self._outlets.append((publisher, out, publisher.plan, out.direct))
 
     @property
     def untapped_ports(self) -> Collection[str]:
@@ -425,8 +430,8 @@ class Station:
         else:
             changed = self._inputs.refresh()
         if changed:
-            _read_controls(self._publishers)
-        for publisher, channel in self._publishers if self._sends else ():
+            _read_controls(self._outlets)
+        for publisher, channel, _, _ in self._outlets if self._sends else ():
             frames = publisher.frames_to_send(cycle, now_ns)
             if frames:
                 publisher.sent(channel.send(frames, now_ns), now_ns)
@@ -470,9 +475,9 @@ class Station:
         return changed
 
 
-def _read_controls(publishers: Iterable[tuple[Publisher | PollResponder, FrameChannel]]) -> None:
+def _read_controls(outlets: Iterable[_Outlet]) -> None:
     """Have publishers follow their control variables."""
-    for publisher, _ in publishers:
+    for publisher, _, _, _ in outlets:
         publisher.read_controls()
 
 

@@ -114,7 +114,7 @@ def test_recording_ends_with_its_readers_and_leaves_nothing_behind(open_recorded
     assert all(
         type(channel).__name__ == "LoopbackChannel"
         for each in stations
-        for _, channel in each._publishers
+        for _, channel, _, _ in each._outlets
     )
     recorded.want()
     recorded.cycles(3)

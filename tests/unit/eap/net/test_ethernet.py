@@ -9,6 +9,7 @@ import time
 
 import pytest
 
+from eap.compiled import cyclic
 from eap.ids import MacAddr
 from eap.net.ethernet import EthernetInterface, packet_batch
 from eap.net.packetsocket import open_packet_pair
@@ -16,6 +17,7 @@ from eap.pd.link import OutFrame
 from tests.unit.eap.net.conftest import ip, wait_for_links
 
 pytestmark = [pytest.mark.net, pytest.mark.root]
+needs_compiled = pytest.mark.skipif(cyclic is None, reason="needs the compiled part: make setup")
 
 GROUP = "01:01:05:04:00:00"
 OTHER_GROUP = "01:01:05:04:00:77"
@@ -193,16 +195,26 @@ def test_ports_of_one_interface_hear_each_other(ends):
     assert far.drain(1) == [expect(1)]
 
 
-def test_port_sends_directly_unless_others_hear_its_frames_or_it_mends_them(ends):
+@needs_compiled
+def test_frames_are_sent_directly_unless_others_hear_them_or_their_port_mends_them(ends):
     near, far = Listener(ends[0]), Listener(ends[1])
-    assert near.port.direct is ends[0].sender
+    assert near.port.direct.may_send
     other = Listener(ends[0], vlan_id=10)
-    assert (near.port.direct, other.port.direct) == (None, None)
+    assert not near.port.direct.may_send
     ends[0].remove(other.port)
-    assert near.port.direct is ends[0].sender
+    assert near.port.direct.may_send
     near.port.readdress()
-    assert near.port.direct is None
-    assert far.port.direct is ends[1].sender
+    assert not near.port.direct.may_send
+    assert far.port.direct.may_send
+
+
+@needs_compiled
+def test_python_drains_while_frames_of_the_own_host_wait(ends):
+    first, second = Listener(ends[0]), Listener(ends[0])
+    first.port.send([first.frame(1)], 7)
+    assert not ends[0].compiled.may_drain
+    assert second.port.drain(0) == 1
+    assert ends[0].compiled.may_drain
 
 
 def test_exchanged_handler_takes_the_frames_of_the_other_and_none_of_its_own_port(ends):

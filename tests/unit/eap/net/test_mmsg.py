@@ -308,7 +308,7 @@ ORIGIN = Origin()
 
 
 def drain(batch, sock, handler):
-    return batch.compiled_drain(sock.fileno(), [handler], ORIGIN)(0)
+    return batch.compiled_socket(sock.fileno(), [handler], ORIGIN, None)(0)
 
 
 @needs_compiled
@@ -378,22 +378,22 @@ def test_compiled_receiver_refuses_memory_that_does_not_fit():
             cyclic.Receiver(*parts[:index], wrong, *parts[index + 1 :])
     for handlers in ({}, ()):
         with pytest.raises(TypeError):
-            batch.compiled_drain(0, handlers, ORIGIN)
+            batch.compiled_socket(0, handlers, ORIGIN, None)
 
 
 @needs_compiled
-def test_compiled_drain_leaves_a_socket_to_its_origin_while_it_is_paused(pair):
-    drain = ReceiveBatch().compiled_drain(pair[1].fileno(), [], ORIGIN)
-    drain.is_paused = True
+def test_compiled_socket_leaves_draining_to_its_origin_when_it_may_not(pair):
+    drain = ReceiveBatch().compiled_socket(pair[1].fileno(), [], ORIGIN, None)
+    drain.may_drain = False
     assert drain(0) == 7
-    drain.is_paused = False
+    drain.may_drain = True
     assert drain(0) == 0
 
 
 @needs_compiled
-def test_compiled_drain_tells_its_origin_of_errors_and_ends_with_it():
+def test_compiled_socket_tells_its_origin_of_errors_and_ends_with_it():
     origin = Origin()
-    drain = ReceiveBatch().compiled_drain(-1, [], origin)
+    drain = ReceiveBatch().compiled_socket(-1, [], origin, None)
     assert (drain(0), origin.errors) == (0, 1)
     del origin
     assert drain(0) == 0

@@ -100,7 +100,7 @@ def test_broken_socket_is_counted_not_raised(channels):
     sender, receiver = channels
     receiver._receive = receiver._batch.reader(-1)
     drains = [partial(UdpChannel.drain, receiver)]
-    if drain := receiver._batch.compiled_drain(-1, receiver.handlers, receiver):
+    if drain := receiver._batch.compiled_socket(-1, receiver.handlers, receiver, None):
         drains.append(drain)
     for number, drain in enumerate(drains, 1):
         assert drain(0) == 0
