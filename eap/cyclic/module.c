@@ -5,7 +5,7 @@
 #include <stdlib.h>
 
 /* Parameters, plans and offsets as eap/compiled.py gives them; raised when either side changes. */
-#define API 7
+#define API 8
 
 PyTypeObject *plan_type, *handler_type, *receiver_type, *socket_type, *patch_type, *send_plan_type;
 static PyTypeObject *cycle_type, *waiter_type, *cycle_frame_type;

@@ -156,11 +156,12 @@ def fill_send_plan(plan: Any, groups: Sequence[FrameGroup]) -> None:
 def compile_cycle(words: memoryview, rarely_every: int, *parts: object) -> Any:
     """Return the compiled cycle of a station of these parts; None without compiled part.
 
+    All other steps are lists, which its ``attach`` takes.
+
     Args:
         words: Of its image.
         rarely_every: Cycles between two drains of the ports that are drained rarely.
-        parts: Lists of drains, of such that are rare, of supervisors, of closing steps and of
-            outlets.  Then the steps that compute variables, run links, copy inputs, read controls,
-            take a sample and wake waiting programs; the first two may be None.
+        parts: The steps that compute variables, run links, copy inputs, read controls, take a
+            sample and wake waiting programs; the first two may be None.
     """
     return None if _cyclic is None else _cyclic.Cycle(words, rarely_every, parts)

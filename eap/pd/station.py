@@ -136,11 +136,6 @@ class Station:
         self._compiled = compile_cycle(
             image.words,
             self._rarely_every,
-            self._drains,
-            self._rarely,
-            self._supervisors,
-            self._closing,
-            self._outlets,
             self._generate if self._computes else None,
             self._run_links,
             self._inputs.refresh,
@@ -150,6 +145,7 @@ class Station:
         )
         if self._compiled is not None:
             override(self, "cycle", self._compiled.run)
+        self._attach()
 
     def _subscriber(self, port: str) -> Subscriber:
         rows = zip(self.spec.subscriptions, self.image.layout.rx, strict=True)
@@ -215,11 +211,18 @@ class Station:
 
     def _connect_senders(self) -> None:
         """Have the publishers send through their channels, or through the taps of their ports."""
-        # In place, as all lists of steps: the compiled cycle goes through the same ones.
         self._outlets.clear()
         for port, publisher, channel in self._senders:
             out = self._taps[port][0].sending(channel) if port in self._taps else channel
             self._outlets.append((publisher, out, publisher.plan, out.direct))
+        self._attach()
+
+    def _attach(self) -> None:
+        """Have the compiled cycle go through the present steps."""
+        if self._compiled is not None:
+            self._compiled.attach(
+                self._drains, self._rarely, self._supervisors, self._closing, self._outlets
+            )
 
     @property
     def untapped_ports(self) -> Collection[str]:
@@ -260,6 +263,7 @@ class Station:
         self._drains.append(bus.receive)
         self._supervisors.append(partial(_supervise, bus))
         self._closing.append(bus.exchange)
+        self._attach()
 
     def memory_of(self, writer: Writer) -> memoryview:
         """Return where the cycle reads the variables of *writer*, at their offsets in the image.
@@ -380,7 +384,7 @@ class Station:
         self._inputs.reload()
         kept = self._subscribers.keys() - self._added
         replaced = [self._subscribers[port].handle_timeout for port in kept]
-        self._supervisors[:] = [each for each in self._supervisors if each not in replaced]
+        self._supervisors = [each for each in self._supervisors if each not in replaced]
         for port in kept:
             self._keep_subscriber(port, before, now_ns)
         self._taps = before._taps

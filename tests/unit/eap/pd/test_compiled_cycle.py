@@ -401,6 +401,7 @@ def test_frames_that_go_by_their_schedule_run_no_python():
         made.cycle()
         side = made.sides[0]
         side.station._rarely.clear()
+        side.station._attach()
         side.image.words[StationWord.WAITERS] = -1000
         with CountCalls() as calls:
             for now_ns in range(2000 * MS, 2010 * MS, MS):
@@ -520,16 +521,15 @@ def test_plan_that_does_not_fit_is_refused():
     ):
         with pytest.raises(ValueError, match="plan"):
             plan.fill(*wrong)
-    parts = [[], [], [], [], [], None, None, print, print, print, print]
-    cyclic.Cycle(words, 10, tuple(parts))
-    for wrong in (
-        (words[:50], 10, tuple(parts)),
-        (words, 0, tuple(parts)),
-        (words, 10, tuple(parts[:-1])),
-        (words, 10, (None, *parts[1:])),
-    ):
+    parts = (None, None, print, print, print, print)
+    cycle = cyclic.Cycle(words, 10, parts)
+    for wrong in ((words[:50], 10, parts), (words, 0, parts), (words, 10, parts[:-1])):
         with pytest.raises(ValueError, match="cycle"):
             cyclic.Cycle(*wrong)
+    for lists in (([], [], [], [], [1]), ([], [], [], [], [(1, 2, 3)]), ([], [], [], [], 7)):
+        with pytest.raises((ValueError, TypeError)):
+            cycle.attach(*lists)
+        cycle.run(1, 1)
 
 
 def test_quality_of_words_that_are_no_index_is_the_largest():
@@ -553,19 +553,38 @@ def test_errors_of_steps_are_raised():
     def no(*_: object) -> bool:
         return False
 
+    def yes(*_: object) -> bool:
+        return True
+
     for place in range(11):
-        parts: list = [[], [], [], [], [], no, no, no, no, no, no]
-        parts[place] = [fail] if place < 4 else [(1, 2)] if place == 4 else fail
+        lists: list = [[], [], [], [], []]
+        parts = [no, no, no, no, no, no]
+        if place < 5:
+            lists[place] = [fail if place < 4 else (1, 2, None, None)]
+        else:
+            parts[place - 5] = fail
         if place == 8:
-            parts[7] = lambda: True
+            parts[2] = yes
         cycle = cyclic.Cycle(words, 1, tuple(parts))
+        cycle.attach(*lists)
         cycle.sends = True
-        words[StationWord.SAMPLED_UNTIL] = words[StationWord.CYCLE] + 1
-        with pytest.raises((KeyError, ValueError)):
-            cycle.run(1, 1)
+        for _ in range(2):
+            words[StationWord.SAMPLED_UNTIL] = words[StationWord.CYCLE] + 1
+            words[StationWord.APPLICATION_SEQUENCE] += 2
+            with pytest.raises((KeyError, AttributeError)):
+                cycle.run(1, 1)
     for wrong in ((), (1,), ("a", 1), (1, "a"), (1 << 70, 1), (1, 1 << 70)):
         with pytest.raises((TypeError, OverflowError)):
             cycle.run(*wrong)
+
+
+def test_steps_do_not_change_and_no_cycle_begins_while_one_runs():
+    words = memoryview(bytearray(8 * 512)).cast("q")
+    cycle = cyclic.Cycle(words, 1, (None, None, print, print, print, print))
+    for step in (lambda _: cycle.attach([], [], [], [], []), lambda now_ns: cycle.run(now_ns, 1)):
+        cycle.attach([], [], [step], [], [])
+        with pytest.raises(RuntimeError, match="runs"):
+            cycle.run(1, 1)
 
 
 def test_station_is_freed_without_the_collector():
@@ -586,6 +605,7 @@ def test_cycle_in_a_cycle_is_collected():
         made.cycle()
         side = made.sides[0]
         side.station._closing.append(lambda now_ns, station=side.station: None)
+        side.station._attach()
         gone = weakref.ref(side.station)
         del side.station
         gc.collect()
