@@ -82,8 +82,8 @@ def pd(name: str, number: int, *variables: str, **trigger: object) -> TxPdSpec:
 
 SCHEDULED = (
     TxFrameSpec("f", "eap0", THERE, (pd("p", 1, "x", "flag"), pd("q", 2, "y"))),
-    TxFrameSpec("g", "eap0", THERE, (pd("r", 3, "bit", "x", "two"),), divider=2, modulo=1),
-    TxFrameSpec("h", "eap0", THERE, (pd("s", 4, "a", "x", cycle_us=3000), )),
+    TxFrameSpec("g", "eap0", THERE, (pd("r", 3, "bit", "two", "x", "flag"),), divider=2, modulo=1),
+    TxFrameSpec("h", "eap0", THERE, (pd("s", 4, "a", "two", "bit", cycle_us=3000), )),
     TxFrameSpec("i", "eap0", THERE, (pd("t", 5, "copy", "b"), pd("u", 6, "field", "count"))),
 )  # fmt: skip
 OTHERS = {
@@ -332,7 +332,8 @@ class Run:
 
     def put(self, name: str, number: int) -> None:
         if name in self.twins.sides[0].image.slots:
-            self.twins.each(put, name, bool(number & 1) if name == "flag" else number)
+            values = {"flag": bool(number & 1), "two": 85 * number}
+            self.twins.each(put, name, values.get(name, number))
 
     def arrive(self, ids: tuple[int, ...], number: int) -> None:
         self.frames += 1
