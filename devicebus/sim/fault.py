@@ -294,9 +294,11 @@ class FaultySegment:
 
     def next_timeout(self) -> int | None:
         """Return the time of the next frame, fault or slave timer."""
-        times = [self.segment.next_timeout()]
-        times += [queue[0][0] for queue in (self._due, self._returning) if queue]
-        return min((at for at in times if at is not None), default=None)
+        first = self.segment.next_timeout()
+        for queue in (self._due, self._returning):
+            if queue and (first is None or queue[0][0] < first):
+                first = queue[0][0]
+        return first
 
     def handle_timeout(self, now_ns: int) -> None:
         """Start and end faults, and handle the timers of slaves."""

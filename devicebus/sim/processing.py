@@ -74,10 +74,10 @@ class Chain:
         """Process *frame* in place; return False if a controller destroys it as circulating."""
         if len(frame) < EtherCatHeader.SIZE:
             return True
-        header = EtherCatHeader.decode(frame)
-        if header.type != FrameType.DATAGRAM:
+        word = frame[0] | frame[1] << 8
+        if word >> 12 != FrameType.DATAGRAM:
             return True
-        end = min(EtherCatHeader.SIZE + header.length, len(frame))
+        end = min(EtherCatHeader.SIZE + (word & _LENGTH), len(frame))
         offset = EtherCatHeader.SIZE
         while offset + OVERHEAD <= end:
             command, _, adp, ado, flags, _ = _HEADER.unpack_from(frame, offset)

@@ -201,11 +201,13 @@ class SimulatedSegment:
 
     def next_timeout(self) -> int | None:
         """Return the next time for :meth:`handle_timeout`."""
-        times = [at for slave in self.slaves if (at := slave.next_timeout()) is not None]
-        if not times:
-            return None
+        first = None
+        for slave in self.slaves:
+            at = slave.next_timeout()
+            if at is not None and (first is None or at < first):
+                first = at
         # Timers of slaves are checked once per POLL_NS: an earlier call has no effect.
-        return max(min(times), self._poll_at_ns or 0)
+        return first if first is None else max(first, self._poll_at_ns or 0)
 
     def handle_timeout(self, now_ns: int) -> None:
         """Handle the timers of slaves; calls within POLL_NS cost nothing."""

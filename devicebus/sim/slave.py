@@ -146,7 +146,11 @@ class SimulatedSlave:
         """Handle timers: watchdog, time-out of the first outputs, messages of mailbox servers."""
         if not self.is_powered:
             return
-        if self.esc.watchdog.check(now_ns) and self.state is AlState.OP:
+        # Called for every slave with each frame: most have nothing to do.
+        watchdog = self.esc.watchdog
+        expires_ns = watchdog.deadline_ns
+        is_over = expires_ns is not None and now_ns >= expires_ns
+        if is_over and watchdog.check(now_ns) and self.state is AlState.OP:
             self._stop_outputs()
         if self._deadline_ns is not None and now_ns >= self._deadline_ns:
             self._deadline_ns = None
@@ -164,8 +168,10 @@ class SimulatedSlave:
         """Return the next time for :meth:`handle_timeout`."""
         if not self.is_powered:
             return None
-        times = [at for at in (self.esc.watchdog.deadline_ns, self._deadline_ns) if at is not None]
-        return min(times, default=None)
+        watchdog_ns, deadline_ns = self.esc.watchdog.deadline_ns, self._deadline_ns
+        if watchdog_ns is None or (deadline_ns is not None and deadline_ns < watchdog_ns):
+            return deadline_ns
+        return watchdog_ns
 
     def offer_inputs(self, now_ns: int) -> None:
         """Update the input area after a change that no frame caused."""

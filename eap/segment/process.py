@@ -30,7 +30,6 @@ from eap.runtime.busfile import BusFile, load_or_raise
 from eap.runtime.handover import NO_DESCRIPTOR, SegmentHandover
 from eap.runtime.startup import Startup, catch_end_signals
 
-_BATCH = 64
 _MS = 1_000_000
 _STALL_NS = 2_000_000
 """Lateness from which frames that wait are taken before the watchdogs of slaves are looked at."""
@@ -217,16 +216,13 @@ class _Loop:
         return None if due is None else max(0.0, (due - now_ns) / _MS)
 
     def _forward_frames(self) -> None:
-        """Forward the frames that wait, at most a batch of each line."""
-        waiting = list(self._sockets.items())
-        # In turn: the copies of a frame on both lines of a ring pass at about the same time.
-        for _ in range(_BATCH):
-            waiting = [line for line in waiting if self._forward_frame(*line)]
-            if not waiting:
-                return
+        """Forward the next frame of each line, or run due timers if none waits."""
+        # One: the copies of a frame on both lines of a ring pass at about the same time, and for
+        # the usual single frame the next poll costs less than to look again.
+        for side, sock in self._sockets.items():
+            self._forward_frame(side, sock)
 
-    def _forward_frame(self, side: SegmentEnd, sock: SegmentSocket) -> bool:
-        """Forward the next frame of a line; return False if none waits."""
+    def _forward_frame(self, side: SegmentEnd, sock: SegmentSocket) -> None:
         segment = self._segment
         arrival = sock.receive()
         now_ns = time.monotonic_ns()
@@ -240,7 +236,6 @@ class _Loop:
             segment.receive_frame(arrival.frame, now_ns, side=side, origin=arrival.origin)
         for out in segment.frames_to_send(now_ns):
             self._send(out)
-        return arrival is not None
 
     def _send(self, out: Outgoing) -> None:
         origin = out.origin
