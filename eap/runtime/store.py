@@ -68,6 +68,9 @@ class Stored(Configuration, frozen=True, kw_only=True):
     """True if *cause* was rolled back: *previous* is what it had brought."""
 
 
+_ConfigurationT = TypeVar("_ConfigurationT", bound=Configuration)
+
+
 class AppliedRouting(AoeRecord, frozen=True, kw_only=True):
     """Routes and access rules that a station was given while it ran.
 
@@ -292,6 +295,9 @@ def adopt_plant_file(
         base = digest_of(spec)
         if stored.applied == base:
             updated = replace(stored, base=base)
+        elif _is_moved(spec, stored, stored.applied):
+            moved = _moved(stored, spec.phase_us, stored.applied, base)
+            updated = replace(moved, base=base, applied=base)
         else:
             updated = _with_plant_file(
                 stored, Stored(base=base, spec=spec, state=state, cause=cause)
@@ -323,9 +329,31 @@ def _effective(plant: str, spec: StationSpec, state: DeviceState, cause: str) ->
     # The plant file is the one that was configured: the stored state of the station goes on.
     if stored.base == base:
         return Effective(stored.spec, stored.state)
-    updated = _with_plant_file(stored, Stored(base=base, spec=spec, state=state, cause=cause))
+    if _is_moved(spec, stored, stored.base):
+        updated = _moved(stored, spec.phase_us, stored.base, base)
+    else:
+        updated = _with_plant_file(stored, Stored(base=base, spec=spec, state=state, cause=cause))
     _keep(file, updated)
     return Effective(updated.spec, updated.state)
+
+
+def _is_moved(spec: StationSpec, stored: Stored, base: str) -> bool:
+    """Return whether *spec* differs from the one with the digest *base* in its phase alone."""
+    # A phase that the file leaves open follows from all of its stations, and a release may derive
+    # it in another way: nobody has edited the station then.
+    return digest_of(replace(spec, phase_us=stored.spec.phase_us)) == base
+
+
+def _moved(stored: Stored, phase_us: int, before: str, base: str) -> Stored:
+    """Return *stored* with another phase, and *base* for *before*, also for a rollback."""
+    own = stored.spec.phase_us
+
+    def moved(each: _ConfigurationT) -> _ConfigurationT:
+        spec = replace(each.spec, phase_us=phase_us) if each.spec.phase_us == own else each.spec
+        return replace(each, spec=spec, base=base if each.base == before else each.base)
+
+    previous = None if stored.previous is None else moved(stored.previous)
+    return replace(moved(stored), previous=previous)
 
 
 def _keep(file: StationFile[Stored], stored: Stored) -> None:

@@ -241,6 +241,31 @@ def test_file_that_was_applied_is_not_edited_since(stations):
     assert kept("left").read() == replace(stored, base=digest_of(applied))
 
 
+def moved(spec, phase_us: int = 250):
+    return replace(spec, phase_us=spec.phase_us + phase_us)
+
+
+def test_file_whose_phases_are_derived_in_another_way_is_not_edited(stations, caplog):
+    left, _ = stations
+    before = Configuration(base=digest_of(left), spec=left)
+    kept("left").save(replace(configured(left), previous=before))
+    assert effective("demo", (moved(left),))[0].spec == moved(changed(left))
+    now = kept("left").read()
+    assert now.previous == Configuration(base=digest_of(moved(left)), spec=moved(left))
+    assert effective("demo", (moved(left),))[0].spec == now.spec
+    assert not caplog.text
+
+
+def test_file_that_was_applied_is_not_edited_by_another_phase(stations, caplog):
+    left, _ = stations
+    applied = changed(left, "new file")
+    kept("left").save(replace(configured(left), applied=digest_of(applied)))
+    adopt_plant_file("demo", (moved(applied),))
+    assert effective("demo", (moved(applied),))[0].spec == moved(changed(left))
+    assert kept("left").read().applied == digest_of(moved(applied))
+    assert not caplog.text
+
+
 def test_file_before_the_one_that_was_applied_is_an_edited_one(stations, caplog):
     left, _ = stations
     stored = replace(configured(left), applied=digest_of(changed(left)))
