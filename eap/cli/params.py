@@ -46,6 +46,24 @@ def station_option(command: CommandT) -> CommandT:
     )(command)
 
 
+def ms_option(
+    name: str, text: str, *, default: int, least: int = 10
+) -> Callable[[CommandT], CommandT]:
+    """Return the decorator that adds the option *name* of at most a minute in milliseconds.
+
+    The function gets its value as *name* with ``_ms`` behind it; *text* is its help.
+    """
+    return click.option(
+        f"--{name}",
+        f"{name}_ms",
+        type=click.IntRange(least, 60_000),
+        default=default,
+        show_default=True,
+        metavar="MS",
+        help=text,
+    )
+
+
 def parse_cycle(ctx: click.Context, param: click.Parameter, text: str | None) -> int | None:
     """Return the microseconds of a device cycle given in milliseconds, as an option's callback.
 

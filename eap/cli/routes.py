@@ -11,7 +11,7 @@ import click
 from eap.cli.completion import complete_station
 from eap.cli.group import ExitCode, LazyGroup
 from eap.cli.output import Renderer, json_option, write_text
-from eap.cli.params import ANSWER_MARGIN_S, examples, plant_option
+from eap.cli.params import ANSWER_MARGIN_S, examples, ms_option, plant_option
 from eap.errors import ControlError
 
 if TYPE_CHECKING:
@@ -213,15 +213,7 @@ def remove(
 @click.command(short_help="Test routes and measure round trips.")
 @click.argument("station", required=False, metavar="[STATION]", shell_complete=complete_station)
 @click.argument("targets", nargs=-1, metavar="[TARGET]...")
-@click.option(
-    "--timeout",
-    "timeout_ms",
-    type=click.IntRange(1, 60_000),
-    default=5000,
-    show_default=True,
-    metavar="MS",
-    help="Timeout of each answer.",
-)
+@ms_option("timeout", "Timeout of each answer.", default=5_000, least=1)
 @plant_option
 @json_option("Print one object per target and line.")
 @click.pass_context
@@ -371,15 +363,7 @@ def _read(file: Path) -> str:
     metavar="FILE",
     help="File with the password in its first line [default: prompt]",
 )
-@click.option(
-    "--wait",
-    "wait_ms",
-    type=click.IntRange(10, 60_000),
-    default=5000,
-    show_default=True,
-    metavar="MS",
-    help="Timeout of the answer.",
-)
+@ms_option("wait", "Timeout of the answer.", default=5_000)
 @click.option("--tls", is_flag=True, help="By Secure ADS (TCP 8016), with STATION's certificate.")
 @click.option(
     "--fingerprint",
@@ -457,15 +441,7 @@ def _password(user: str, file: Path | None) -> str:
     metavar="ADDRESS",
     help="IPv4 address of a host or network [default: the networks of STATION]",
 )
-@click.option(
-    "--wait",
-    "wait_ms",
-    type=click.IntRange(10, 60_000),
-    default=1000,
-    show_default=True,
-    metavar="MS",
-    help="Waiting time for answers.",
-)
+@ms_option("wait", "Waiting time for answers.", default=1_000)
 @plant_option
 @json_option("Print one object per router and line.")
 def scan(

@@ -341,15 +341,21 @@ def _holds_other_files(path: Path) -> bool:
         return False  # it does not exist, or claiming it will say what is wrong
 
 
+def take_lock(fd: int) -> None:
+    """Lock a file until the last process that has *fd* ends; raise BlockingIOError if it is taken.
+
+    :meth:`ApplianceFolder.is_alive` takes no lock, so it never prevents a start.
+    """
+    # An OFD lock: a POSIX one would be dropped when this process closes any descriptor of the file.
+    fcntl.fcntl(fd, fcntl.F_OFD_SETLK, _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0))
+
+
 def _lock(path: Path) -> int:
     """Take the lock of *path*; a folder removed by its last owner meanwhile is made again."""
     while True:
         fd = os.open(path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
-            # An OFD lock: a POSIX one would be dropped when this process closes any descriptor of
-            # the file.
-            request = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
-            fcntl.fcntl(fd, fcntl.F_OFD_SETLK, request)
+            take_lock(fd)
         except BlockingIOError:
             holder = os.pread(fd, 16, 0).decode("ascii", "replace") or "another process"
             os.close(fd)

@@ -6,10 +6,8 @@ wrote there last remains, so that a recording that was killed is listed as such.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
-import struct
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
@@ -25,10 +23,10 @@ from eap.runtime.folder import (
     folder_name,
     runtime_root,
     runtime_roots,
+    take_lock,
 )
 
 _FOLDER = ".recordings"
-_FLOCK = struct.Struct("hhqqi4x")
 _THINGS = {"values": "variable", "frames": "port"}
 KEPT = 32
 """Recordings that ended and are listed; older ones are forgotten, their files are not."""
@@ -109,8 +107,7 @@ class RecordingFolder(Closeable):
         except OSError as exc:
             raise EnvironmentalError(f"{path}: {exc.strerror}") from None
         try:
-            # As that of an appliance: a test for it takes no lock, so it never prevents a start.
-            fcntl.fcntl(lock_fd, fcntl.F_OFD_SETLK, _FLOCK.pack(fcntl.F_WRLCK, 0, 0, 0, 0))
+            take_lock(lock_fd)
         except BlockingIOError:
             os.close(lock_fd)
             raise EnvironmentalError(
