@@ -24,6 +24,8 @@ _MAX_MESSAGE = 8192
 _MAX_DESCRIPTORS = 16
 """Descriptors of one message: a socket has two, a bus six."""
 _DESCRIPTOR_SPACE = socket.CMSG_SPACE(_MAX_DESCRIPTORS * array.array("i").itemsize)
+# CLOEXEC at once: a process that is started in between must not inherit them.
+_RECEIVE_FLAGS = socket.MSG_DONTWAIT | socket.MSG_CMSG_CLOEXEC
 
 MessageT = TypeVar("MessageT")
 
@@ -123,10 +125,8 @@ def receive_descriptors(link: socket.socket) -> tuple[bytes, list[int]] | None:
 
     The message is empty when the other end is closed.
     """
-    # CLOEXEC at once: a process that is started in between must not inherit them.
-    flags = socket.MSG_DONTWAIT | socket.MSG_CMSG_CLOEXEC
     try:
-        message, ancillary, _, _ = link.recvmsg(_MAX_MESSAGE, _DESCRIPTOR_SPACE, flags)
+        message, ancillary, _, _ = link.recvmsg(_MAX_MESSAGE, _DESCRIPTOR_SPACE, _RECEIVE_FLAGS)
     except OSError:
         return None
     descriptors = array.array("i")
