@@ -90,7 +90,9 @@ class _Forked(subprocess.Popen[Any]):
     def _execute_child(  # type: ignore[misc]
         self, args: Sequence[str], *more: Any
     ) -> None:
-        _, _, _, pass_fds, cwd, env, _, _, _, *pipes = more[:15]
+        executable, prepare, _, pass_fds, cwd, env, _, _, shell, *pipes = more[:15]
+        if executable or prepare or shell or more[16:21] != (None, None, None, -1, False):
+            raise ValueError("a forked process takes no program, function, shell, user or session")
         own = pipes[0], pipes[3], pipes[5]
         standard = [given if given >= 0 else number for number, given in enumerate(own)]
         request = {
