@@ -91,7 +91,8 @@ def bridge_of(plant: Appliance) -> dict[str, Any]:
 async def connected(url: str = URL, user: str = "", password: str = "secret") -> AsyncIterator[Any]:
     from asyncua import Client
 
-    client = Client(url, timeout=20)
+    # asyncua gives up a server that does not answer within this time, as one on a busy machine.
+    client = Client(url, timeout=20, watchdog_intervall=20)
     if user:
         client.set_user(user)
         client.set_password(password)
@@ -486,7 +487,7 @@ def test_server_goes_on_with_many_clients_and_without_some(press):
     async def crowd() -> None:
         from asyncua import Client
 
-        clients = [Client(URL, timeout=60) for _ in range(100)]
+        clients = [Client(URL, timeout=60, watchdog_intervall=60) for _ in range(100)]
         try:
             async with asyncio.TaskGroup() as group:
                 for each in clients:
