@@ -76,17 +76,26 @@ def run_phases(
 ) -> list[float]:
     """Run *exchange* again and again in each phase that begins; return good ones a second.
 
-    The process waits without any exchange before each of *phases*, whose number is set in *words*.
+    A phase begins when its number is set in *words*.  Before the first one exchanges go on, for the
+    watchdogs of slaves; before the others there are none, for something takes the place of slaves.
+
+    Raises:
+        RuntimeError: no exchange of a phase was good.
     """
     rates = []
     for phase in range(1, job["phases"] + 1):
         answer({"ready": True})
         while words[Page.PHASE] < phase:
-            wait(0.001)
+            if phase == 1:
+                exchange()
+            else:
+                wait(0.001)
         begin_ns, before = monotonic_ns(), good()
         end_ns = begin_ns + int(job["seconds"] * 1e9)
         while (now_ns := monotonic_ns()) < end_ns:
             for _ in range(_EXCHANGES):
                 exchange()
+        if good() == before:
+            raise RuntimeError("no cycle had the right working counter")
         rates.append((good() - before) / (now_ns - begin_ns) * 1e9)
     return rates
