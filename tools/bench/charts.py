@@ -142,10 +142,12 @@ def _group(y: int, group: Comparison, longest: float) -> Iterable[str]:
         if group.target is not None and bar.kind is BarKind.OURS:
             x = _LABELS + round(_BARS * group.target / longest)
             yield f'<path class="x" d="M{x} {line - 3}v{_BAR + 6}"/>'
-            if at - 6 <= x < at + _LETTER * len(text):
+            space = _LETTER * len(text)
+            if at - 6 <= x < at + space and width > space:
                 # Beside the mark it would be taken for the target.
                 yield _text(at - 12, line + 12, text, "i", "end")
                 continue
+            at = x + 6 if at - 6 <= x < at + space else at
         yield _text(at, line + 12, text, "s")
 
 

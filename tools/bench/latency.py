@@ -81,7 +81,7 @@ def figures_of(
         else:
             figures.append(report(title, f"{ratio:.2f} ({detail})", ratio))
     middle = {each: median(found["p50"] for found in results[each]) / 1000 for each in results}
-    bars = [Bar(way.name, middle[way.name], way.kind) for way in (OURS, RAW, C, *PEERS)
+    bars = [Bar(way.name, middle[way.name], way.kind) for way in (OURS, SPINNING, RAW, C, *PEERS)
             if way.name in middle]  # fmt: skip
     figures[0] = figures[0].compared(
         name.removeprefix("latency, "), "µs", bars, target * middle[RAW.name]

@@ -49,6 +49,15 @@ def test_value_is_not_beside_the_mark_of_the_target(target: float, anchor: str |
     assert value.get("text-anchor") == anchor
 
 
+def test_value_of_a_short_bar_is_behind_the_mark() -> None:
+    bars = (Bar("ours", 4.0, BarKind.OURS), Bar("a C loop", 200.0, BarKind.LIMIT))
+    picture = draw(SHARED, [Comparison("frames", "thousand/s", bars, 10.0)])
+    texts, paths = ([*fromstring(picture).iter(SVG + each)] for each in ("text", "path"))
+    (value,) = (each for each in texts if each.text == "4.00 thousand/s")
+    (_, mark) = (each for each in paths if each.get("class") == "x")  # behind that of the legend
+    assert int(value.get("x")) > int(mark.get("d")[1:].split()[0])
+
+
 def test_charts_are_written_for_what_was_measured(tmp_path: Path) -> None:
     figure = Figure("a", "1").compared("frames", "thousand/s", BARS, 70.0)
     figures = {"throughput": [figure, Figure("b", "2")], "bus": [Figure("c", "3")]}
