@@ -28,6 +28,7 @@ from eap.codec.coe import (
     SdoResponse,
     SdoSegmentHeader,
     decode_segment,
+    decode_upload,
     encode_abort,
     encode_initiate,
     encode_message,
@@ -50,6 +51,7 @@ SEGMENTS = {
 }
 """Command specifiers of segments, with those of the first message of their transfer."""
 _UPLOADED, _RESPONSE = SdoResponse.UPLOAD, CoeService.SDO_RESPONSE
+_SDO_REQUEST = CoeService.SDO_REQUEST.value
 
 
 class SegmentedTransfer:
@@ -153,6 +155,8 @@ class SdoServer:
             return []
         if specifier in SEGMENTS:
             answer = self._continue(body)
+        elif specifier == _UPLOAD:
+            answer = self._upload(body)
         else:
             answer = self._start(SdoHeader.decode(body), body[SdoHeader.SIZE :])
         return [answer]
@@ -160,27 +164,29 @@ class SdoServer:
     def _start(self, head: SdoHeader, rest: bytes) -> bytes:
         self._transfer = None
         try:
-            if head.specifier == _UPLOAD:
-                body = self._start_upload(head)
-            elif head.specifier == _DOWNLOAD:
-                body = self._start_download(head, rest)
-            else:
+            if head.specifier != _DOWNLOAD:
                 return encode_abort(head.index, head.subindex, AbortCode.COMMAND)
+            body = self._start_download(head, rest)
         except SdoAbortError as exc:
             return encode_abort(head.index, head.subindex, exc.code)
         return encode_message(_RESPONSE, body)
 
-    def _start_upload(self, head: SdoHeader) -> bytes:
-        index, subindex, complete = head.index, head.subindex, bool(head.complete)
+    def _upload(self, body: bytes) -> bytes:
+        self._transfer = None
+        index, subindex, complete = decode_upload(body)
         read = self._dictionary.upload_complete if complete else self._dictionary.upload
-        data = read(index, subindex, self._state())
+        try:
+            data = read(index, subindex, self._state())
+        except SdoAbortError as exc:
+            return encode_abort(index, subindex, exc.code)
         data_size = self._sizes.to_master - INITIATE_OVERHEAD
         # Up to four bytes go into the header (expedited) and fit every mailbox.
-        if len(data) > max(data_size, EXPEDITED_SIZE):
-            self._transfer = SegmentedTransfer(head, len(data), data[data_size:])
-        return encode_initiate(
+        if len(data) > data_size and len(data) > EXPEDITED_SIZE:
+            self._transfer = SegmentedTransfer(SdoHeader.decode(body), len(data), data[data_size:])
+        answer = encode_initiate(
             _UPLOADED, index, subindex, data, complete=complete, max_size=data_size
         )
+        return encode_message(_RESPONSE, answer)
 
     def _start_download(self, head: SdoHeader, rest: bytes) -> bytes:
         where = (head.index, head.subindex)
@@ -345,10 +351,11 @@ class CoeServer:
     def receive_message(self, data: bytes, now_ns: int) -> list[bytes]:
         """Handle a message (without mailbox header) and return its answers."""
         del now_ns
-        header = decode_or_error(CoeHeader.decode, data)
         body = data[CoeHeader.SIZE :]
-        if header.service is CoeService.SDO_REQUEST:
+        # The upper four bits are the service; an SDO has nothing else in this header.
+        if len(data) >= CoeHeader.SIZE and data[1] >> 4 == _SDO_REQUEST:
             return self._sdo.receive_request(body)
+        header = decode_or_error(CoeHeader.decode, data)
         if header.service is CoeService.SDO_INFORMATION:
             return self._info.receive_request(body)
         return self._answer_pdo(header, body)

@@ -154,6 +154,19 @@ _EXPEDITED = 0b11
 """With data in the header, of which the size is said."""
 
 
+_COMPLETE = 0x10
+
+
+def decode_upload(request: Buffer) -> tuple[int, int, bool]:
+    """Return index, subindex and complete access of an upload request without CoE header.
+
+    This does in one step what :class:`SdoHeader` does, for what is received most.  The request has
+    four bytes or more.
+    """
+    command, index, subindex = _HEAD.unpack_from(request)
+    return index, subindex, bool(command & _COMPLETE)
+
+
 class SdoSegmentHeader(WireStruct, frozen=True):
     """ETG.1000.6, SDO segment: *unused* counts only where fewer than 7 bytes of data follow."""
 
