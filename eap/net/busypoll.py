@@ -32,6 +32,8 @@ _LONG_NS = 1_000_000_000
 
 _Ts = TypeVarTuple("_Ts")
 Event: TypeAlias = tuple[SelectorKey, int]
+Watcher: TypeAlias = Callable[[], object]
+"""Handles what waits in a descriptor; returns a true value if there was something."""
 
 
 class BusyPollSelector(EpollSelector):
@@ -59,42 +61,70 @@ class BusyPollSelector(EpollSelector):
         self._retries = 0
         self._skipped = 0
         self._backoff = 1
+        self._latest: Watcher | None = None
+
+    def unwatch(self, fd: int) -> None:
+        """Forget a descriptor with a function; harmless for another one."""
+        key = self.get_map().get(fd)
+        if key is not None and callable(key.data):
+            self.unregister(fd)
+            if key.data is self._latest:
+                self._latest = None
 
     def select(self, timeout: float | None = None) -> list[Event]:
-        """Return what is ready within *timeout* seconds, None for any time."""
+        """Return what the loop has to handle within *timeout* seconds, None for any time."""
         # Without a time-out of its own the loop has work, which is not delayed.
         if timeout is not None and timeout <= 0:
             return self._handle(super().select(0))
         began_ns = self._clock()
         end_ns = began_ns + (_LONG_NS if timeout is None else int(timeout * 1e9))
         self.has_work = False
-        events = self._poll(began_ns, end_ns) or super().select(timeout)
         for _ in range(MAX_ROUNDS):
+            events = self._poll(began_ns, end_ns)
+            if self.has_work:
+                break
             if not events:
-                return []
+                left_ns = end_ns - self._clock()
+                if left_ns <= 0:
+                    break
+                events = super().select(None if timeout is None else left_ns / 1e9)
+                if not events:
+                    break
             self._is_quick = self._clock() - began_ns < QUICK_NS
             others = self._handle(events)
             if others or self.has_work:
                 return others
             # All was handled here: the loop would only come back.
             began_ns = self._clock()
-            events = self._poll(began_ns, end_ns)
-        return self._handle(events)
+        return []
 
     def _poll(self, began_ns: int, end_ns: int) -> list[Event]:
-        """Poll where the next event is probably near; return the events, if there are any."""
+        """Poll where the next event is probably near; return the events, if there are any.
+
+        The function that was called last is called again, which takes less time than to find out
+        that it has something to do.
+        """
         if self._skipped:
             self._skipped -= 1
             return []
         if not (self._is_quick or self._retries):
             return []
         clock, select = self._clock, super().select
-        end_ns = min(end_ns, began_ns + SPIN_LIMIT_NS)
-        while clock() <= end_ns:
-            if events := select(0):
+        limit_ns = min(end_ns, began_ns + SPIN_LIMIT_NS)
+        calls = 0
+        while clock() <= limit_ns and calls < MAX_ROUNDS:
+            if self._latest is not None and self._call(self._latest):
+                self._retries, self._backoff = MAX_FRUITLESS, 1
+                if self.has_work:
+                    return []
+                limit_ns = min(end_ns, clock() + SPIN_LIMIT_NS)
+                calls += 1
+            elif events := select(0):
                 self._retries, self._backoff = MAX_FRUITLESS, 1
                 return events
         self._is_quick = False
+        if calls:
+            return []
         # A quick sender has some more chances.
         if self._retries:
             self._retries -= 1
@@ -120,17 +150,23 @@ class BusyPollSelector(EpollSelector):
     def _handle_one(self, key: SelectorKey, mask: int) -> bool:
         """Handle an event, unless it is for the loop; return whether it was not."""
         if callable(key.data):
-            try:
-                key.data()
-            except Exception as exc:  # noqa: BLE001  as the loop does with its callbacks
-                self._report(exc)
+            self._latest = key.data
+            self._call(key.data)
             return True
+        self._latest = None
         reader, _ = key.data
         if mask != EVENT_READ or not isinstance(reader, asyncio.Handle):
             return False
         # The loop would do the same, after two more steps for each event.
         reader._run()  # noqa: SLF001
         return True
+
+    def _call(self, watcher: Watcher) -> bool:
+        try:
+            return bool(watcher())
+        except Exception as exc:  # noqa: BLE001  as the loop does with its callbacks
+            self._report(exc)
+            return False
 
 
 class BusyPollLoop(asyncio.SelectorEventLoop):
@@ -140,14 +176,17 @@ class BusyPollLoop(asyncio.SelectorEventLoop):
         self._polling = BusyPollSelector(self._report)
         super().__init__(self._polling)
 
-    def watch(self, fd: int, handle: Callable[[], object]) -> None:
-        """Call *handle* whenever something waits in *fd*; no other event of it is noticed."""
+    def watch(self, fd: int, handle: Watcher) -> None:
+        """Call *handle* whenever something waits in *fd*; no other event of it is noticed.
+
+        It may be called although nothing waits there.
+        """
         self._polling.register(fd, EVENT_READ, handle)
 
     def unwatch(self, fd: int) -> None:
         """Undo :meth:`watch`; harmless for a descriptor that is not watched."""
-        if not self.is_closed() and fd in self._polling.get_map():
-            self._polling.unregister(fd)
+        if not self.is_closed():
+            self._polling.unwatch(fd)
 
     def call_soon(
         self,

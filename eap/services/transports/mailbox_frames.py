@@ -102,8 +102,8 @@ class WithDescriptor(Protocol):
 def watch_channel(channel: DrainedChannel) -> None:
     """Drain *channel* now and whenever something arrives, as long as the running loop lives."""
 
-    def drain() -> None:
-        channel.drain(monotonic_ns())
+    def drain() -> int:
+        return channel.drain(monotonic_ns())
 
     loop = asyncio.get_running_loop()
     watch = loop.watch if isinstance(loop, BusyPollLoop) else loop.add_reader
