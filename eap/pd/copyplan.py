@@ -6,12 +6,14 @@ another bit alignment in source and target, are copied without touching adjacent
 
 from __future__ import annotations
 
+import struct
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from eap.codec.wire import Buffer
+from eap.compiled import cyclic
 
 
 class Move(NamedTuple):
@@ -41,7 +43,7 @@ class CopyPlan:
         ValueError: two moves write the same bit, or one is empty or begins before the memory.
     """
 
-    __slots__ = ("_bits", "_shifts", "_slices")
+    __slots__ = ("_bits", "_compiled", "_shifts", "_slices")
 
     def __init__(
         self,
@@ -68,6 +70,7 @@ class CopyPlan:
         self._bits = [
             (source, target, *_table(tuple(parts))) for (source, target), parts in pieces.items()
         ]
+        self._compiled = self._compile() if cyclic is not None and self.operations else None
 
     @property
     def operations(self) -> int:
@@ -76,6 +79,9 @@ class CopyPlan:
 
     def run(self, source: Buffer, target: memoryview) -> None:
         """Copy everything; both may be the same memory."""
+        if self._compiled is not None:
+            self._compiled.run(source, target)
+            return
         for where, what in self._slices:
             target[where] = source[what]
         for octet, where_octet, keep, table in self._bits:
@@ -83,6 +89,20 @@ class CopyPlan:
         for where, what, shift, mask, size in self._shifts:
             value = int.from_bytes(source[what], "little") >> shift & mask
             target[where] = value.to_bytes(size, "little")
+
+    def _compile(self) -> Any:
+        """Return the same copies for the compiled part."""
+        assert cyclic is not None  # noqa: S101  by the caller
+        pack = struct.pack
+        slices = [
+            pack("=3q", what.start, to.start, to.stop - to.start) for to, what in self._slices
+        ]
+        bits = [pack("=3q256s", *each) for each in self._bits]
+        shifted = [
+            pack("=4q", what.start, to.start, size, shift)
+            for to, what, shift, _, size in self._shifts
+        ]
+        return cyclic.Copies(b"".join(slices), b"".join(bits), b"".join(shifted))
 
     def _add_octets(self, part: Move) -> None:
         """Plan whole bytes of the target."""

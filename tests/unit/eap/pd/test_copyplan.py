@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eap.compiled import cyclic
+from eap.pd import copyplan
 from eap.pd.copyplan import CopyPlan, Move
 
 SOURCE_SIZE = 24
@@ -123,3 +126,69 @@ def test_copy_plan_rejects_invalid_moves(move):
 def test_a_bit_that_two_moves_write_is_refused():
     with pytest.raises(ValueError, match="write the same bit"):
         CopyPlan([(0, 0, 4), (0, 3, 4)])
+
+
+@pytest.mark.skipif(cyclic is None, reason="needs the compiled part: make setup")
+@given(plans(), SOURCES, st.integers(0, 255), st.booleans())
+def test_compiled_copies_are_those_of_python(plan, source, fill, is_same):
+    moves, size = plan
+    compiled = CopyPlan(moves)
+    assert compiled._compiled is not None or not moves
+    python = CopyPlan(moves)
+    python._compiled = None
+    outcomes = []
+    for each in (compiled, python):
+        memory = bytearray(source + bytes([fill]) * max(size, SOURCE_SIZE))
+        view = memoryview(memory)
+        each.run(view if is_same else source, view[SOURCE_SIZE:])
+        outcomes.append(bytes(memory))
+    assert outcomes[0] == outcomes[1]
+
+
+@pytest.mark.skipif(cyclic is None, reason="needs the compiled part: make setup")
+@pytest.mark.parametrize(("begin", "end"), [(3, 8), (11, 8), (8, 3), (16, 8), (8, 16), (5, 8)])
+def test_compiled_copy_onto_itself_reads_before_it_writes(begin, end, monkeypatch):
+    outcomes = []
+    for part in (cyclic, None):
+        monkeypatch.setattr(copyplan, "cyclic", part)
+        memory = bytearray(range(1, 40))
+        CopyPlan([Move(begin, end, 200)]).run(memory, memoryview(memory))
+        outcomes.append(bytes(memory))
+    assert outcomes[0] == outcomes[1]
+
+
+@pytest.mark.skipif(cyclic is None, reason="needs the compiled part: make setup")
+def test_compiled_copies_stay_within_their_memory():
+    plan = CopyPlan([Move(0, 0, 16), Move(17, 16, 16), Move(40, 33, 3)])
+    memory = memoryview(bytearray(5))
+    plan.run(bytes(6), memory)
+    for source, target in ((bytes(5), memory), (bytes(6), memory[:4])):
+        with pytest.raises(ValueError, match="outside"):
+            plan.run(source, target)
+    with pytest.raises(TypeError):
+        plan.run(bytes(6), bytes(5))
+
+
+@pytest.mark.skipif(cyclic is None, reason="needs the compiled part: make setup")
+@pytest.mark.parametrize(
+    ("slices", "bits", "shifted"),
+    [
+        (bytes(23), b"", b""),
+        (b"", bytes(279), b""),
+        (b"", b"", bytes(32)),
+        (b"\xff" * 24, b"", b""),
+    ],
+)
+def test_compiled_copies_that_are_none_are_refused(slices, bits, shifted):
+    with pytest.raises(ValueError, match=r"cut off|outside|within a byte"):
+        cyclic.Copies(slices, bits, shifted)
+
+
+@pytest.mark.skipif(cyclic is None, reason="needs the compiled part: make setup")
+def test_compiled_shifted_copy_reads_one_byte_more_than_it_writes():
+    copies = cyclic.Copies(b"", b"", struct.pack("=4q", 0, 0, 2, 3))
+    with pytest.raises(ValueError, match="outside"):
+        copies.run(bytes(2), bytearray(2))
+    target = bytearray(2)
+    copies.run(b"\x08\x10\x07", target)
+    assert target == b"\x01\xe2"
