@@ -116,6 +116,7 @@ def test_writes_are_repeated_after_a_restart(fault):
         unit.device.al_state = AlState.INIT
         unit.esc.set_al_status(0x11, 0x0060)
     line.elapse_until(lambda: unit.state is AlState.OP)
+    assert unit.state is AlState.OP
     assert line.written == [("PREOP", 0x8000, 1)]
 
 
@@ -133,6 +134,7 @@ def test_refused_write_leaves_the_slave_out_and_is_named():
     # It is tried again: a slave that takes the value later reaches OP.
     line.segment.slaves[0].device.dictionary.entry(0x8002, 0).maximum = None
     line.elapse_until(lambda: line.segment.slaves[0].state is AlState.OP)
+    assert line.segment.slaves[0].state is AlState.OP
     assert line.core.cycle.is_full
 
 
@@ -182,6 +184,7 @@ def test_mapping_and_assignment_are_written_before_the_writes_of_ps():
     line.elapse(200 * MS)
     line.segment.switch(0, on=True)
     line.elapse_until(lambda: line.segment.slaves[0].state is AlState.OP)
+    assert line.segment.slaves[0].state is AlState.OP
     assert line.segment.slaves[0].device.process_data.inputs.size == 2
 
 

@@ -98,6 +98,7 @@ def test_slave_that_is_plugged_in_is_configured_and_exchanges_data():
     bad = line.core.stats().cycle.wkc_errors
     line.segment.mend(1)
     line.elapse_until(lambda: line.tool.state is AlState.OP)
+    assert line.tool.state is AlState.OP
     assert kinds(line.events()) == [("SlaveBack", 1003)]
     tool = line.core.slaves[1003]
     assert (tool.is_absent, tool.found.position, tool.found.name) == (False, 2, "tool")
@@ -120,6 +121,7 @@ def test_unplugged_slave_is_absent_and_returns():
         assert exchange(line, 1002)
         line.segment.mend(1)
         line.elapse_until(lambda: line.tool.state is AlState.OP)
+        assert line.tool.state is AlState.OP
         assert kinds(line.events()) == [("SlaveBack", 1003)]
         assert exchange(line, 1003)
         assert line.core.cycle.is_full
@@ -144,6 +146,7 @@ def test_power_loss_of_an_optional_slave_is_the_same():
     line.elapse(300 * MS)
     line.segment.switch(1, on=True)
     line.elapse_until(lambda: line.tool.state is AlState.OP)
+    assert line.tool.state is AlState.OP
     assert kinds(line.events()) == [("SlaveAbsent", 1003), ("SlaveBack", 1003)]
 
 
@@ -176,6 +179,7 @@ def test_another_unit_of_the_same_kind_may_be_plugged_in():
     line.segment.switch(1, on=True)
     line.segment.mend(1)
     line.elapse_until(lambda: line.tool.state is AlState.OP)
+    assert line.tool.state is AlState.OP
     assert line.core.slaves[1003].found.identity.serial == 77
 
 
@@ -257,10 +261,12 @@ def test_group_that_is_plugged_in_is_told_by_its_identification():
     bring(line)
     line.segment.mend(2)
     line.elapse_until(lambda: line.segment.slaves[2].state is AlState.OP)
+    assert line.segment.slaves[2].state is AlState.OP
     assert [each.is_absent for each in line.core.slaves.values()] == [False, True, False]
     assert line.core.slaves[1003].found.alias == 6
     line.segment.mend(1)
     line.elapse_until(lambda: line.segment.slaves[1].state is AlState.OP)
+    assert line.segment.slaves[1].state is AlState.OP
     assert all(exchange(line, station) for station in line.core.slaves)
     # In the order of the segment: port 3 comes before port 2.
     assert list(line.core.slaves) == [1001, 1003, 1002]
@@ -286,6 +292,7 @@ def test_clocks_and_sync0_of_a_slave_that_is_plugged_in():
     bring(line)
     line.segment.mend(1)
     line.elapse_until(lambda: line.segment.slaves[1].state is AlState.OP)
+    assert line.segment.slaves[1].state is AlState.OP
     one, two = (each.esc.clock.system_time(line.now_ns) for each in line.segment.slaves)
     assert abs(one - two) < 1000
     assert line.segment.slaves[1].esc.clock.sync0_is_active
@@ -307,6 +314,7 @@ def test_slave_with_the_address_of_another_is_taken_in_without_it(stale):
     line.tool.esc.memory[0x10:0x12] = stale.to_bytes(2, "little")
     line.segment.mend(1)
     line.elapse_until(lambda: {each.state for each in line.segment.slaves} == {AlState.OP})
+    assert {each.state for each in line.segment.slaves} == {AlState.OP}
     assert all(exchange(line, station) for station in line.core.slaves)
     assert line.core.cycle.is_full
 

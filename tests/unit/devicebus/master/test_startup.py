@@ -144,6 +144,7 @@ def test_startup_refusing_slave_does_not_stop_the_others():
     assert states(line) == [AlState.OP, AlState.SAFEOP, AlState.OP]
     line.segment.slaves[1].refused_states.clear()
     line.elapse_until(lambda: set(states(line)) == {AlState.OP})
+    assert set(states(line)) == {AlState.OP}
 
 
 def test_startup_slave_below_preop_keeps_its_part_of_the_image():
@@ -155,6 +156,7 @@ def test_startup_slave_below_preop_keeps_its_part_of_the_image():
     assert line.core.cycle.is_good
     line.segment.slaves[1].refused_states.clear()
     line.elapse_until(lambda: set(states(line)) == {AlState.OP})
+    assert set(states(line)) == {AlState.OP}
     line.core.image.write(1002, "out", True)
     line.elapse(5 * MS)
     assert line.segment.slaves[1].device.dictionary.entry(0x7000, 1).value
@@ -207,6 +209,7 @@ def test_slaves_that_need_sync0_reach_op_with_their_clocks_together():
     )
     line.wait(line.core.bring_up(line.now_ns))
     line.elapse_until(lambda: set(states(line)) == {AlState.OP})
+    assert set(states(line)) == {AlState.OP}
     one, two = (each.esc.clock.system_time(line.now_ns) for each in line.segment.slaves)
     assert abs(one - two) < 1000
     assert abs(one - line.now_ns - 10**17) < 10 * MS
@@ -214,6 +217,7 @@ def test_slaves_that_need_sync0_reach_op_with_their_clocks_together():
     line.elapse(100 * MS)
     line.segment.switch(1, on=True)
     line.elapse_until(lambda: set(states(line)) == {AlState.OP})
+    assert set(states(line)) == {AlState.OP}
     one, two = (each.esc.clock.system_time(line.now_ns) for each in line.segment.slaves)
     assert abs(one - two) < 1000
     assert all(each.esc.clock.sync0_is_active for each in line.segment.slaves)
