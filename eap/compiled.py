@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from types import ModuleType
 
-_API = 9
+_API = 10
 """Of the source; a file that was built from an older one is not used."""
 
 

@@ -125,7 +125,7 @@ Result send_due(const Outlet *outlet, const Moment *moment);
 extern PyTypeObject *plan_type, *handler_type, *receiver_type, *socket_type, *patch_type,
     *send_plan_type;
 extern PyType_Spec plan_spec, handler_spec, receiver_spec, socket_spec, patch_spec, send_plan_spec,
-    cycle_spec, waiter_spec, cycle_frame_spec, copies_spec;
+    cycle_spec, waiter_spec, cycle_frame_spec, copies_spec, source_steps_spec;
 extern PyObject *text_fast, *text_source, *text_source_of, *text_wanted;
 
 #endif

@@ -5,10 +5,10 @@
 #include <stdlib.h>
 
 /* Parameters, plans and offsets as eap/compiled.py gives them; raised when either side changes. */
-#define API 9
+#define API 10
 
 PyTypeObject *plan_type, *handler_type, *receiver_type, *socket_type, *patch_type, *send_plan_type;
-static PyTypeObject *cycle_type, *waiter_type, *cycle_frame_type, *copies_type;
+static PyTypeObject *cycle_type, *waiter_type, *cycle_frame_type, *copies_type, *source_steps_type;
 PyObject *text_fast, *text_source, *text_source_of, *text_wanted;
 
 static const struct {
@@ -20,7 +20,7 @@ static const struct {
     {&patch_spec, &patch_type},       {&send_plan_spec, &send_plan_type},
     {&cycle_spec, &cycle_type},       {&waiter_spec, &waiter_type},
     {&cycle_frame_spec, &cycle_frame_type},
-    {&copies_spec, &copies_type},
+    {&copies_spec, &copies_type},     {&source_steps_spec, &source_steps_type},
 };
 
 static const struct {

@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache, partial
 from math import isfinite
 from typing import Any, NamedTuple
 
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType
+from eap.pd.compiledsources import SourceStep, compile_steps, number_step, random_step
 from eap.pd.copyplan import CopyPlan, Move
 from eap.pd.image import Image
 from eap.pd.layout import VariableSlot
@@ -230,8 +231,18 @@ _STRIDE = 40_503
 class Generators:
     """Computes all generated variables of one station."""
 
-    def __init__(self, image: Image, sources: Iterable[EngineSource]) -> None:
-        self._steps = [_generator_step(image, source) for source in sources]
+    def __init__(self, image: Image, sources: Sequence[EngineSource]) -> None:
+        compiled: list[tuple[SourceStep, Callable[[int], None]]] = []
+        others: list[Callable[[int], None]] = []
+        for source in sources:
+            step, mine = _compiled_step(image, source), _generator_step(image, source)
+            if step is None:
+                others.append(mine)
+            else:
+                compiled.append((step, mine))
+        reference = [mine for _, mine in compiled]
+        run = compile_steps([step for step, _ in compiled], image.memory, partial(_run, reference))
+        self._steps = [*(reference if run is None else [run]), *others]
 
     def run(self, tick: int) -> None:
         """Store the values of the time *tick*, in cycle times since the first cycle.
@@ -240,6 +251,27 @@ class Generators:
         """
         for step in self._steps:
             step(tick)
+
+
+def _run(steps: Iterable[Callable[[int], None]], tick: int) -> None:
+    for step in steps:
+        step(tick)
+
+
+def _compiled_step(image: Image, source: EngineSource) -> SourceStep | None:
+    """Return the step for the compiled part, None if it has none for the source."""
+    slot = image.slot(source.variable)
+    kind, offset = datatypes.parse(slot.type), slot.bit_offset // 8
+    if isinstance(source, RandomSource):
+        sequence = _random_sequence(source.seed, kind.size)
+        return random_step(offset, kind.size, _STRIDE, _POSITIONS, sequence)
+    period_ms = 0 if isinstance(source, CounterSource) else source.period_ms
+    return number_step(source, kind, offset, _cycles(period_ms, image.layout.cycle_us))
+
+
+def _cycles(period_ms: float, cycle_us: int) -> float:
+    """Return a period in cycles, at least one."""
+    return max(period_ms * 1000 / cycle_us, 1.0)
 
 
 def _generator_step(image: Image, source: EngineSource) -> Callable[[int], None]:
@@ -295,7 +327,7 @@ def _number_step(
     if isinstance(source, CounterSource):
         step = source.step
         return lambda tick: store(float(tick * step))
-    period = max(source.period_ms * 1000 / cycle_us, 1.0)
+    period = _cycles(source.period_ms, cycle_us)
     if isinstance(source, RampSource):
         low, span = float(source.low), source.high - source.low
         return lambda tick: store(low + span * (tick % period) / period)

@@ -71,6 +71,7 @@ def compile_part(root: Path, target: Path) -> None:
     """
     compiler = shlex.split(os.environ.get("CC", "cc"))
     flags = ["-O2", "-g0", "-Wall", "-shared", "-fPIC", "-fvisibility=hidden", "-fwrapv"]
+    flags.append("-ffp-contract=off")  # numbers are those of Python, bit by bit
     flags += ["-fno-plt", "-Wl,-z,now"]  # many calls of Python's functions, each once a cycle
     include = sysconfig.get_path("include")
     # Beside the target and renamed: a process that runs has the old one mapped.
