@@ -67,7 +67,7 @@ from eap.control.protocol import (
 )
 from eap.errors import CodecError, ControlError
 from eap.ids import NetId
-from eap.live.transport import StreamConnection, ValuesSubscription, gone
+from eap.live.transport import NumberedConnection, ValuesSubscription, gone
 from eap.ops.client import checked
 
 CONNECT_S = 3.0
@@ -104,7 +104,7 @@ class RemoteHost(NamedTuple):
         return self.host if self.net_id is None else f"{self.host}:{self.net_id}"
 
 
-class AdsConnection(StreamConnection[AmsAnswer]):
+class AdsConnection(NumberedConnection[AmsAnswer]):
     """The appliance of a remote station (PlantConnection).
 
     Args:

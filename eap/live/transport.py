@@ -79,7 +79,7 @@ def gone(why: str) -> ControlError:
 AnswerT = TypeVar("AnswerT")
 
 
-class StreamConnection(ABC, Generic[AnswerT]):
+class NumberedConnection(ABC, Generic[AnswerT]):
     """Base of connections by a stream whose requests and answers have numbers.
 
     Args:
@@ -121,7 +121,7 @@ class StreamConnection(ABC, Generic[AnswerT]):
                 answer.exception()  # so that asyncio does not miss a requester just cancelled
 
 
-class UnixConnection(StreamConnection[ControlReply]):
+class UnixConnection(NumberedConnection[ControlReply]):
     """The control socket of one appliance (PlantConnection).
 
     Requests are answered in their order; several may be under way.
