@@ -92,7 +92,7 @@ def _station(number: int, cycle_us: int) -> StationSpec:
         name=f"station-{number}",
         net_id=NetId.parse(f"127.0.1.{number}.1.1"),
         cycle_us=cycle_us,
-        phase_us=(number - 1) * cycle_us // 2,  # as the plant file staggers two stations
+        phase_us=(number - 1) * cycle_us // 2,  # a wake-up for each
         ports=(
             PortSpec(
                 "eap0",
