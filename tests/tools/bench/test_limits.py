@@ -73,3 +73,14 @@ def test_search_goes_from_its_target_to_the_limit(good_up_to: int, looked_at: li
     assert [case for case, _ in found] == looked_at
     bad = [case for case in looked_at if case > good_up_to]
     assert sorted(calls) == sorted(looked_at + bad), "a case that fails is observed twice"
+
+
+def test_plant_that_does_not_get_ready_is_not_started_again() -> None:
+    calls: list[int] = []
+
+    def look(case: int) -> Observation | None:
+        calls.append(case)
+        return SEEN if case < 3 else None
+
+    assert limits.search(range(1, 9), 4, look) == [(2, SEEN), (3, None), (4, None)]
+    assert calls == [4, 3, 2]
