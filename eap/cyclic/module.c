@@ -103,9 +103,21 @@ static int fill(PyObject *module) {
     return failed ? -1 : PyModule_AddIntConstant(module, "API", API);
 }
 
+/* keep_order(): as eap/pd/ordering.py says. */
+static PyObject *keep_order(PyObject *module, PyObject *nothing) {
+    (void)module;
+    (void)nothing;
+    __atomic_thread_fence(__ATOMIC_SEQ_CST);
+    Py_RETURN_NONE;
+}
+
+static PyMethodDef functions[] = {
+    {"keep_order", keep_order, METH_NOARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
 static struct PyModuleDef definition = {
     PyModuleDef_HEAD_INIT, "eap._cyclic", "Compiled part of the cyclic path.", -1,
-    NULL, NULL, NULL, NULL, NULL,
+    functions, NULL, NULL, NULL, NULL,
 };
 
 PyMODINIT_FUNC PyInit__cyclic(void) {

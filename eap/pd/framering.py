@@ -23,6 +23,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from eap.errors import ImageError
+from eap.pd import ordering
 
 MAGIC = b"EAPRING1"
 HEADER_SIZE = 65_536
@@ -179,11 +180,15 @@ class FrameRingWriter:
             at = 0
         words, ring = self._words, self._ring
         words[_RESERVED] = end = words[_WRITTEN] + after - at
+        if ordering.REORDERS:
+            ordering.keep_order()
         self._records = number = self._records + 1
         start = at + _HEAD_SIZE
         _pack_head(ring, at, port, size, number & 0xFFFFFFFF, at_ns, address)
         ring[start : start + size] = frame
         self._at = after
+        if ordering.REORDERS:
+            ordering.keep_order()
         words[_RECORDS] = number
         words[_WRITTEN] = end
 
@@ -196,6 +201,8 @@ class FrameRingWriter:
             self._begin_lap()
         words, ring, at = self._words, self._ring, self._at
         words[_RESERVED] = end = words[_WRITTEN] + total
+        if ordering.REORDERS:
+            ordering.keep_order()
         number, head = self._records, port | _SENT
         for address, frame, step in frames:
             number += 1
@@ -206,6 +213,8 @@ class FrameRingWriter:
             at += step
         self._at = at
         self._records = number
+        if ordering.REORDERS:
+            ordering.keep_order()
         words[_RECORDS] = number
         words[_WRITTEN] = end
 
@@ -213,10 +222,12 @@ class FrameRingWriter:
         words = self._words
         lap = words[_WRITTEN] + self._capacity - self._at
         words[_RESERVED] = lap
+        ordering.keep_order()
         if self._at + _HEAD.size <= self._capacity:
             _HEAD.pack_into(self._ring, self._at, _REST, 0, 0, 0, 0)
         self._at = 0
         words[_LAP] = lap
+        ordering.keep_order()
         words[_WRITTEN] = lap
 
 
@@ -264,7 +275,9 @@ class FrameRingReader:
 
     def _take(self) -> FrameRun | None:
         words = self._words
-        written, lap = words[_WRITTEN], words[_LAP]
+        written = words[_WRITTEN]
+        ordering.keep_order()
+        lap = words[_LAP]
         if written == self._position:
             return None
         if words[_RESERVED] - self._position > self._capacity:
@@ -275,6 +288,7 @@ class FrameRingReader:
         start = position % self._capacity
         end = min(start + written - position, self._capacity)
         octets = bytes(self._ring[start:end])
+        ordering.keep_order()
         if words[_RESERVED] - position > self._capacity:
             return None  # overtaken while it copied; the next call begins at the lap
         self._position = position + end - start

@@ -29,6 +29,7 @@ import msgspec
 from eap.codec import datatypes
 from eap.codec.datatypes import DataType, find_variable, split_paths
 from eap.errors import ImageError, TornReadError
+from eap.pd import ordering
 from eap.pd.layout import (
     HEADER,
     LAYOUT_VERSION,
@@ -186,7 +187,9 @@ class Image:
         if sequence % 2 or words[_FUTEX] != cycle & 0xFFFFFFFF:
             return None
         # Copied without a lock and checked afterwards: the engine never waits for a reader.
+        ordering.keep_order()
         copy = self._copy()
+        ordering.keep_order()
         return copy if words[_SEQUENCE] == sequence and words[_CYCLE] == cycle else None
 
     def snapshot(self) -> Image:
@@ -237,9 +240,11 @@ class Image:
         sequence = self.layout.regions[writer].sequence
         # A predecessor that was killed in the middle left an odd word; odd it stays until we end.
         self.words[sequence] += 1 + self.words[sequence] % 2
+        ordering.keep_order()
         try:
             yield
         finally:
+            ordering.keep_order()
             self.words[sequence] += 1
 
     def release(self) -> None:
@@ -262,7 +267,9 @@ class Image:
             # A sequence lock: a writer never waits for a reader, so the engine cannot be held up.
             before = words[sequence]
             if not before % 2:
+                ordering.keep_order()
                 data = bytes(self.memory[first:last])
+                ordering.keep_order()
                 if words[sequence] == before:
                     return data
             self._pause()
@@ -429,7 +436,9 @@ class Inputs:
                 # writes.
                 words[_TORN] += 1
                 continue
+            ordering.keep_order()
             copy = bytes(self._image.memory[region])
+            ordering.keep_order()
             if words[sequence] != before:
                 continue  # a new write began meanwhile; the next cycle has it
             self.memory[region] = copy
@@ -473,11 +482,13 @@ class Sampler:
         # The cycle number is cleared first and written last: a reader that sees the same number
         # before and after its copy has a whole sample.
         self._heads[head] = _NO_CYCLE
+        ordering.keep_order()
         self._heads[head + 1] = now_ns
         start = slot.offset + number * slot.size + SAMPLE_HEAD
         middle = start + self._engine.stop - self._engine.start
         memory[start:middle] = memory[self._engine]
         memory[middle : start - SAMPLE_HEAD + slot.size] = self._inputs[self._others]
+        ordering.keep_order()
         self._heads[head] = cycle
 
 
@@ -529,6 +540,7 @@ class ImageSamples:
         """Return when *cycle* ran, on the monotonic clock; None if there is no sample of it."""
         head = self._head(cycle)
         at_ns = self._heads[head + 1]
+        ordering.keep_order()
         return at_ns if self._heads[head] == cycle else None
 
     def read(self, cycle: int) -> bytes | None:
@@ -536,6 +548,7 @@ class ImageSamples:
         start = self._slot.offset + cycle % self._slot.count * self._slot.size + SAMPLE_HEAD
         # Copied first and checked afterwards: the engine may reuse the slot at any moment.
         data = bytes(self.image.memory[start : start - SAMPLE_HEAD + self._slot.size])
+        ordering.keep_order()
         return data if self._heads[self._head(cycle)] == cycle else None
 
     def _head(self, cycle: int) -> int:

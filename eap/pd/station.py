@@ -18,6 +18,7 @@ from typing import NamedTuple, TypeAlias
 import msgspec
 
 from eap.compiled import override
+from eap.pd import ordering
 from eap.pd.address import NetIdLearner, forget
 from eap.pd.authentication import KeyRing, SigningChannel
 from eap.pd.compiledplan import compile_cycle
@@ -429,6 +430,7 @@ class Station:
         cycle = words[_CYCLE] + 1
         words[_CYCLE] = cycle  # one by one: pack_into would show readers a 0 in between
         words[_CYCLE_AT_NS] = due_ns
+        ordering.keep_order()
         if self._computes or self._drains or not cycle % self._rarely_every:
             changed = self._write_own_variables(cycle, now_ns)
         else:
@@ -449,6 +451,7 @@ class Station:
         if late_ns > words[_LATENESS_MAX_NS]:  # noqa: PLR1730  max() takes five times as long
             words[_LATENESS_MAX_NS] = late_ns
         self._samples.end_cycle(cycle, now_ns)
+        ordering.keep_order()
         words[_FUTEX] = cycle & 0xFFFFFFFF
         # Never cleared here: a program that comes between the look and the clearing would sleep on.
         if cycle - words[_WAITERS] <= WAKE_FOR_CYCLES:
@@ -460,6 +463,8 @@ class Station:
         sequence = words[_SEQUENCE]
         # Odd for the whole block, so that a reader sees inputs and their results in one cycle.
         words[_SEQUENCE] = sequence + 1
+        if ordering.REORDERS:
+            ordering.keep_order()
         for drain in self._drains:
             drain(now_ns)
         if self._rarely and not cycle % self._rarely_every:
@@ -475,6 +480,8 @@ class Station:
                 self._run_links()
         else:
             changed = self._inputs.refresh()
+        if ordering.REORDERS:
+            ordering.keep_order()
         words[_SEQUENCE] = sequence + 2
         return changed
 

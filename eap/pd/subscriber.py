@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 from eap.codec.ethercat import EtherCatHeader
 from eap.codec.pd import CYCLE_OFFSET, EAP_SM_OFFSET, FIRST_PD, PD_FRAME_START, PdHeader
 from eap.ids import NetId
+from eap.pd import ordering
 from eap.pd.address import NetIdLearner, SourceWatch
 from eap.pd.authentication import (
     SIGNATURE_FAULTS,
@@ -185,6 +186,7 @@ class Subscriber:
         outside = not words[_SEQUENCE] & 1
         if outside:
             words[_SEQUENCE] += 1
+            ordering.keep_order()
         (cycle,) = _CYCLE_COUNTER(data, CYCLE_OFFSET)
         # Outside of a cycle the data counts as that of the next one, which is the first to use it.
         own_cycle = words[_CYCLE] + outside
@@ -199,6 +201,7 @@ class Subscriber:
             table.note_requests(plan, cycle, data, origin)
             plan.enter_toggle(cycle)
         if outside:
+            ordering.keep_order()
             words[_SEQUENCE] += 1
 
     @property

@@ -22,8 +22,10 @@ from eap.pd import compiledplan
 from eap.pd.authentication import KeyRing, Keys
 from eap.pd.device import DeviceState
 from eap.pd.handover import ImageHandover
+from eap.pd.image import Inputs
 from eap.pd.link import FrameHandler, OutFrame
 from eap.pd.publisher import Publisher
+from eap.pd.quality import ForwardedQuality
 from eap.pd.spec import (
     REQUESTER,
     CounterSource,
@@ -40,7 +42,8 @@ from eap.pd.spec import (
     Writer,
 )
 from eap.pd.station import Station
-from eap.pd.words import StationWord
+from eap.pd.txframe import Gather, Selection, Trigger, TxPd
+from eap.pd.words import RxWord, StationWord
 from tests.support.cyclic import (
     MS,
     PEER,
@@ -409,6 +412,53 @@ def test_frames_that_go_by_their_schedule_run_no_python():
                 side.station.cycle(now_ns, now_ns)
         assert calls == ["CountCalls.__exit__"]
         assert len(side.line.arrived()) == 15
+
+
+def test_frames_of_a_channel_that_does_more_go_through_it():
+    with twins(usual()) as made:
+        side = made.sides[0]
+        made.cycle()
+        assert [each for each in side.line.calls if each < 0] == []
+        made.each(is_direct, False)
+        made.cycle()
+        assert [each for each in side.line.calls if each < 0] == [-made.now_ns]
+
+
+@given(
+    cycle=st.integers(0, 1 << 40),
+    age_cycles=st.one_of(st.integers(-3, 700), st.integers(60_000, 1 << 40)),
+    response_ns=st.sampled_from((0, 99_999, 100_000, 3_000_000, 7_000_000_000)),
+    sent=st.sampled_from((0, 1, 0x1234, 0xFFFF)),
+    came=st.booleans(),
+    field_ns=st.sampled_from((0, 1, 10**9)),
+)
+def test_quality_is_the_same_with_and_without_the_compiled_part(
+    cycle, age_cycles, response_ns, sent, came, field_ns
+):
+    qualities = []
+    for mode in (contextlib.nullcontext, python_alone):
+        image = image_of(spec_of())
+        words, slot = image.words, image.layout.rx[0]
+        first = slot.words
+        words[first + RxWord.TRACKER] = image.layout.rx[1].words
+        tracker = image.layout.rx[1].words
+        words[StationWord.CYCLE], words[StationWord.CYCLE_AT_NS] = cycle, 10**9 + 123_456
+        words[tracker + RxWord.RECEIVED] = came
+        words[tracker + RxWord.ARRIVED_IN_CYCLE] = cycle - age_cycles
+        words[first + RxWord.RESPONSE_NS] = response_ns
+        words[image.layout.fields[0].words] = field_ns
+        struct.pack_into("<H", image.memory, slot.offset + 6, sent)
+        with mode():
+            gather = Gather(image, Inputs(image), ["a"])
+            for origins in ((slot,), (image.layout.fields[0],), (image.layout.fields[0], slot)):
+                placed = TxPd(
+                    image.layout.tx[0], Trigger(TriggerSpec(), None), gather,
+                    ForwardedQuality(image, origins),
+                )  # fmt: skip
+                out = OutFrame(bytearray(60), 0, THERE)
+                Selection(out, (placed,)).patch(7)
+                qualities.append(bytes(out.buffer))
+    assert qualities[:3] == qualities[3:]
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
