@@ -147,7 +147,7 @@ def fill_send_plan(plan: Any, groups: Sequence[FrameGroup]) -> None:
     rows = bytearray()
     for group in groups:
         for counters in group.counters:
-            rows += _row(group.schedule.step, group.schedule.phase, *counters)
+            rows += _row(group.step, group.phase, *counters)
     plan.fill(
         [frame.whole.out for frame in frames], [frame.whole.patch for frame in frames], bytes(rows)
     )

@@ -69,10 +69,11 @@ def _enter_unsent(words: memoryview, frame: FrameSlot, state: FrameState, now_ns
 class FrameGroup:
     """Frames that are sent whole, all in the same cycles: no decision is left but the cycle."""
 
-    __slots__ = ("counters", "frames", "out", "patches", "schedule")
+    __slots__ = ("counters", "frames", "out", "patches", "phase", "step")
 
     def __init__(self, schedule: Schedule, frames: list[TxFrame]) -> None:
-        self.schedule = schedule
+        self.step = schedule.step
+        self.phase = schedule.phase
         self.frames = frames
         self.out = [frame.whole.out for frame in frames]
         self.patches = [frame.whole.patch for frame in frames]
@@ -231,7 +232,7 @@ class Publisher:
 
     def frames_to_send(self, cycle: int, now_ns: int) -> list[OutFrame]:
         """Return the frames due in this cycle, patched; :meth:`sent` must follow."""
-        self._due = due = [group for group in self._groups if group.schedule.is_due(cycle)]
+        self._due = due = [group for group in self._groups if cycle % group.step == group.phase]
         for group in due:
             for patch in group.patches:
                 patch(cycle)
@@ -281,7 +282,7 @@ class Publisher:
 
     def sent_partly(self, cycle: int, failed: Sequence[OutFrame], now_ns: int) -> None:
         """Count the frames of :attr:`plan` that were due, all but *failed*."""
-        self._due = [group for group in self._groups if group.schedule.is_due(cycle)]
+        self._due = [group for group in self._groups if cycle % group.step == group.phase]
         self._sending.clear()
         self.sent(failed, now_ns)
 

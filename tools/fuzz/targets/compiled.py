@@ -1,10 +1,13 @@
-"""Frames for the compiled part of the receive path: the image is the same as without it.
+"""Frames and patches for the compiled part: what it writes is the same as without it.
 
-Where the compiled part was not built, both sides are Python and nothing can differ.
+Where it was not built, both sides are Python and nothing can differ.
 """
 
 from __future__ import annotations
 
+import struct
+
+from eap.compiled import cyclic
 from eap.ids import InterfaceUri, NetId
 from eap.pd.image import Image, format_image
 from eap.pd.layout import plan_layout
@@ -80,8 +83,41 @@ _PAIRS = [
 ]
 
 
+_SOURCES = (bytes(range(1, 41)), bytes(range(200, 230)))
+"""Image and inputs of a patch."""
+_WORDS = memoryview(bytearray(8 * 256)).cast("q")
+_FRAME_SIZE = 48
+_move = struct.Struct("=4q").pack
+
+
+def _patch(data: bytes) -> None:
+    """Write the bits that *data* names, four octets for each move, into a frame.
+
+    A patch that reaches outside of its memory is refused; any other writes those bits alone.
+    """
+    if cyclic is None:
+        return
+    rows = list(zip(*[iter(data)] * 4, strict=False))
+    moves = [(row[0] % 3, 2 * row[1] - 20, 2 * row[2] - 20, row[3]) for row in rows]
+    frame = bytearray(b"\xa5" * _FRAME_SIZE)
+    expected = int.from_bytes(b"\x34\x12" + frame[2:], "little")
+    try:
+        packed = b"".join(_move(*move) for move in moves)
+        patch = cyclic.Patch(frame, 0, _SOURCES, _WORDS, 1000, packed, b"")
+    except ValueError:
+        return
+    patch(0x1234)
+    for memory, source, target, bits in moves:
+        mask = (1 << bits) - 1
+        value = int.from_bytes(_SOURCES[memory], "little") >> source & mask
+        expected = expected & ~(mask << target) | value << target
+    if frame != expected.to_bytes(_FRAME_SIZE, "little"):
+        raise AssertionError(f"a patch of {moves} wrote {frame.hex()}")
+
+
 def fuzz_one(data: bytes) -> None:
     """Give the frame to both sides twice: the first may be one of an unknown layout."""
+    _patch(data[:32])
     pair = _PAIRS[len(data) & 1]
     for _ in range(2):
         for image, _, handle in pair:
