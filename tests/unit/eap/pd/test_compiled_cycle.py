@@ -141,6 +141,7 @@ class Line:
         self.waiting: list[tuple[bytes, int]] = []
         self.handlers: list[FrameHandler] = []
         self.calls: list[int] = []
+        """Times of calls, negative for those of send()."""
 
     def make_direct(self, sender: SendBatch) -> object:
         return BATCH.compiled_socket(sender._fd, [], self, sender)
@@ -165,6 +166,10 @@ class Line:
     def send(self, frames: Sequence[OutFrame], now_ns: int) -> Sequence[OutFrame]:
         self.calls.append(-now_ns)
         return self.sender.send(frames)
+
+    @property
+    def drained(self) -> list[int]:
+        return [each for each in self.calls if each >= 0]
 
     def link_header(self, destination: str) -> bytes:
         del destination
@@ -253,6 +258,7 @@ class Twins:
         assert bytes(one.image.memory) == bytes(other.image.memory)
         assert one.line.sender.errors == other.line.sender.errors
         assert one.wakes == other.wakes
+        assert one.line.drained == other.line.drained
         return sent
 
     def each(self, do: object, *args: object) -> None:
@@ -646,6 +652,35 @@ def test_errors_of_steps_are_raised():
     for wrong in ((), (1,), ("a", 1), (1, "a"), (1 << 70, 1), (1, 1 << 70)):
         with pytest.raises((TypeError, OverflowError)):
             cycle.run(*wrong)
+
+
+def test_region_of_a_writer_that_stopped_is_looked_at_in_each_cycle():
+    with twins(usual()) as made:
+        made.each(put, "x", 5)
+        made.cycle()
+        made.each(add, StationWord.APPLICATION_SEQUENCE, 1)
+        for _ in range(3):
+            made.cycle()
+        assert made.sides[0].image.words[StationWord.TORN] == 3
+
+
+def test_counter_beyond_32_bits_is_the_same():
+    with twins(usual()) as made:
+        made.each(add, StationWord.CYCLE, (1 << 33) - 1)
+        for _ in range(3):
+            made.cycle()
+
+
+def test_ports_without_subscriptions_are_drained_rarely():
+    words = memoryview(bytearray(8 * 512)).cast("q")
+    often: list[int] = []
+    rarely: list[int] = []
+    cycle = cyclic.Cycle(words, 3, (None, None, int, int, int, int))
+    cycle.attach([often.append], [rarely.append], [], [], [])
+    for now_ns in range(1, 10):
+        cycle.run(now_ns, now_ns)
+    assert often == list(range(1, 10))
+    assert rarely == [3, 6, 9]
 
 
 def test_steps_do_not_change_and_no_cycle_begins_while_one_runs():
