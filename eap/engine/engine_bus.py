@@ -427,7 +427,8 @@ class EngineBus:
         frame = self.master.quiet_frame(now_ns) if is_quiet else None
         if frame is not None:
             self._send_frame(self._port, frame)
-            self._set_listening(is_on=False)
+            # A recording has the time at which a frame is taken, so it is taken at once.
+            self._set_listening(is_on=self._port.tap is not None)
         else:
             self.master.start_cycle(now_ns)
             self._send(now_ns)

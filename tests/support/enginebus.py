@@ -69,6 +69,7 @@ class Wire:
     def __init__(self, folder: Path) -> None:
         self.segment = load_or_raise(folder / "bus.yaml").build()
         self.now_ns = 0
+        self.tap = None
         self.is_down = False
         self.is_deaf = False
         self.sent = 0

@@ -281,6 +281,19 @@ def test_replies_of_quiet_cycles_wait_for_the_next_cycle(rig):
         assert 0 < rig.changes - changes < 60
 
 
+def test_replies_are_taken_at_once_while_frames_are_recorded(rig):
+    rig.run(55 * MS)
+    rig.wire.tap = lambda frame, is_sent: None
+    rig.run(2 * MS)
+    changes = rig.changes
+    rig.run(50 * MS)
+    assert rig.is_listening
+    assert rig.changes == changes
+    rig.wire.tap = None
+    rig.run(2 * MS)
+    assert rig.is_listening is (cyclic is None)
+
+
 def test_requests_are_not_kept_waiting_by_quiet_cycles(rig):
     rig.run(55 * MS)
     begun_ns = rig.now_ns
