@@ -92,8 +92,9 @@ class Trial:
         """Let the faults of the case happen; return when they are over."""
         for fault in self._case.faults:
             self._bench.begin(fault)
-        self._go_on(1 * MS)
+        # The next cycle may notice the fault, and a mailbox is closed then.
         self._send_requests()
+        self._go_on(1 * MS)
         return self._last(self._start_ns + self._case.duration_ms * MS)
 
     def _swap(self) -> int:
