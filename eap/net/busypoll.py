@@ -209,5 +209,10 @@ class BusyPollLoop(asyncio.SelectorEventLoop):
         self._polling.has_work = True
         return super().call_at(when, callback, *args, context=context)
 
+    def _read_from_self(self) -> None:
+        # Signals and other threads schedule without call_soon(), and wake the loop by this reader.
+        self._polling.has_work = True
+        super()._read_from_self()  # type: ignore[misc]
+
     def _report(self, error: Exception) -> None:
         self.call_exception_handler({"message": "exception in a watcher", "exception": error})

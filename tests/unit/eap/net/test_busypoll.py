@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 import os
+import signal
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from selectors import EVENT_READ, EpollSelector
@@ -463,3 +465,42 @@ def test_loop_that_is_closed_has_no_watchers():
     loop = BusyPollLoop()
     loop.close()
     loop.unwatch(0)
+
+
+def test_loop_runs_at_once_what_another_thread_asks_for():
+    loop = BusyPollLoop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    try:
+        for _ in range(3):
+            asked = asyncio.run_coroutine_threadsafe(asyncio.sleep(0, "done"), loop)
+            assert asked.result(timeout=20) == "done"
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join(20)
+    assert not thread.is_alive()
+    loop.close()
+
+
+def test_loop_handles_signals_while_nothing_else_happens():
+    loop = BusyPollLoop()
+    noted = []
+
+    def note() -> None:
+        noted.append(signal.SIGUSR2)
+        loop.stop()
+
+    loop.add_signal_handler(signal.SIGUSR2, note)
+    # The signal comes while the loop sleeps; the alarm would end a loop that misses it.
+    before = signal.signal(signal.SIGALRM, lambda *_: pytest.fail("the signal was missed"))
+    signal.alarm(20)
+    sender = threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGUSR2))
+    sender.start()
+    try:
+        loop.run_forever()
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+        sender.join()
+        loop.close()
+    assert noted == [signal.SIGUSR2]
