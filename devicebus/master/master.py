@@ -220,6 +220,8 @@ class Master:
             return False
         if not self._cycles_to_look and self._in_cycle < len(self._looked_at):
             return False
+        if now_ns >= self._look_ns:  # cycles were late, and handle_timeout() looks into mailboxes
+            return False
         return cycle.is_quiet(now_ns) or self._begin_quiet(cycle, now_ns)
 
     def quiet_frame(self, now_ns: int) -> bytes | None:
