@@ -67,6 +67,9 @@ def tower(appliance: Appliance) -> pyads.Connection:
     return open_connection(PORT, DEVICE, ADDRESS)
 
 
+_CALLED_LATE: list[object] = []
+
+
 class Told:
     """The notifications of one connection, taken back at the end: AdsLib crashes otherwise."""
 
@@ -87,6 +90,8 @@ class Told:
         return told
 
     def end(self) -> None:
+        # AdsLib may call back after pyads has dropped the function of a deleted notification.
+        _CALLED_LATE.extend(pyads.pyads_ex.callback_store.values())
         for handles in self._handles:
             self.connection.del_device_notification(*handles)
 

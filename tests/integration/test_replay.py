@@ -78,6 +78,8 @@ class Kept:
             os.kill(state["pid"], signal.SIGKILL)
         both.process.send_signal(signal.SIGINT)
         both.finish()
+        # A process that is killed while it writes to a busy disk ends when that is done.
+        wait_until(lambda: not any(describe(each).recording for each in (self.values, self.frames)))
 
 
 @pytest.fixture(scope="module")

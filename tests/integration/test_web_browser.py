@@ -492,6 +492,8 @@ def test_page_of_a_plant_that_does_not_run_says_so(folder: Plants, chromium: Tab
 
 def test_default_pages_of_the_solar_line(folder: Plants, plant: Appliance, chromium: Tabs):
     plant.stop()  # it has the same addresses
+    from playwright.sync_api import expect
+
     text = (CONFIG / "solar-line.yaml").read_text()
     path = folder.write(f"{text}\nweb: 127.9.62.8:8080\n", "solar-line.yaml")
     line = folder.run(path)
@@ -500,7 +502,7 @@ def test_default_pages_of_the_solar_line(folder: Plants, plant: Appliance, chrom
     page = one.open()
     page.get_by_role("heading", level=1, name="solar-line").wait_for()
     # Until the page knows all stations, it draws senders that it cannot name.
-    page.wait_for_function("document.querySelectorAll('.node').length === 15")
+    expect(page.locator(".node")).to_have_count(15)
     assert page.locator(".link").count() == 54
     page.locator("nav").get_by_role("link", name="island-07").click()
     row = page.locator("tr", has_text=re.compile("^temperature"))
